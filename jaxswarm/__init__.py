@@ -1,0 +1,31 @@
+"""Train cooperative swarms with deep reinforcement learning, as one compiled JAX program."""
+
+from typing import Any
+
+from jaxswarm.aggregators import AGGREGATORS
+from jaxswarm.learners import LEARNERS
+from jaxswarm.networks import ActorCritic
+from jaxswarm.tasks import TASKS
+from jaxswarm.training import Experiment, TrainState, evaluate, init, train
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AGGREGATORS",
+    "LEARNERS",
+    "TASKS",
+    "ActorCritic",
+    "Experiment",
+    "TrainState",
+    "evaluate",
+    "init",
+    "make",
+    "train",
+]
+
+
+def make(name: str, **fields: Any) -> Any:
+    """The task of that name, `TASKS[name](**fields)`; a `ValueError` names what there is."""
+    if name not in TASKS:
+        raise ValueError(f"task = {name!r} is not possible; accepted: {', '.join(TASKS)}")
+    return TASKS[name](**fields)

@@ -1,0 +1,315 @@
+"""What a user writes about a run: YAML groups and `key=value` words in, an `Experiment` out.
+
+A group's file names a registered class and the fields it is built with. Which keys exist and what values they take is
+read off the constructors, so nothing here knows any single task, aggregator or learner. All that is wrong is a
+`ConfigError` of one line, raised before anything is compiled.
+"""
+
+import dataclasses
+import difflib
+import inspect
+import itertools
+import math
+import types
+import typing
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxswarm.training import Experiment
+
+Config = dict[str, Any]
+
+REGISTERED = ("task", "aggregator", "learner")  # groups whose files have a `name`
+PARTS = (*REGISTERED, "network")  # what an experiment is made of, one dict each
+LENGTHS = ("num_updates", "total_agent_steps")  # two ways to say the same
+
+
+class ConfigError(ValueError):
+    """Something the user wrote is not possible; the message says what would be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a config says beyond the experiment. Of `num_updates` and `total_agent_steps`, one is given."""
+
+    seed: int = 0
+    num_updates: int | None = None
+    total_agent_steps: int | None = None
+    checkpoint_seconds: float = 30.0
+    keep_checkpoints: int = 3
+
+    def __post_init__(self) -> None:
+        if (self.num_updates is None) == (self.total_agent_steps is None):
+            raise ConfigError("give one of num_updates and total_agent_steps")
+        least = {"seed": 0, "checkpoint_seconds": 0, "num_updates": 1, "total_agent_steps": 1, "keep_checkpoints": 1}
+        for name, bound in least.items():
+            value = getattr(self, name)
+            if value is not None and value < bound:
+                raise ConfigError(f"{name} = {value!r} is not possible; accepted: numbers from {bound}")
+        if self.seed >= 2**32:
+            raise ConfigError(f"seed = {self.seed} is not possible; accepted: numbers below 2**32")
+
+    def length(self, agent_steps_per_update: int) -> int:
+        """Number of updates; a last update that is only partly wanted is done in full."""
+        if self.num_updates is not None:
+            return self.num_updates
+        assert self.total_agent_steps is not None
+        return math.ceil(self.total_agent_steps / agent_steps_per_update)
+
+
+def config_dir() -> Path:
+    """Where the groups are: inside the package once installed, beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    places = (package / "configs", package.parent / "configs")
+    for place in places:
+        if (place / "train.yaml").is_file():
+            return place
+    raise ConfigError(f"the default configs are not installed; looked in {' and '.join(map(str, places))}")
+
+
+def choices() -> dict[str, list[str]]:
+    """Names of the groups, and of the files in each."""
+    groups = sorted(path for path in config_dir().iterdir() if path.is_dir())
+    return {group.name: sorted(path.stem for path in group.glob("*.yaml")) for group in groups}
+
+
+def compose(words: Sequence[str] = ()) -> Config:
+    """The config that `words` such as `learner=ppo` and `task.num_agents=50` ask for: checked, complete, plain data."""
+    from hydra import compose, initialize_config_dir  # noqa: PLC0415
+    from hydra.errors import HydraException  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
+    groups = choices()
+    pairs = parse(words)
+    chosen = {key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and value is not None}
+    try:
+        with initialize_config_dir(str(config_dir()), version_base="1.3"):
+            composed = compose("train", [f"{group}={choice}" for group, choice in chosen.items()])
+    except HydraException as error:
+        raise ConfigError(" ".join(str(error).split())) from error
+    config = typing.cast(Config, OmegaConf.to_container(composed, resolve=True))
+    return override(config, [(key, value) for key, value in pairs if key not in groups])
+
+
+def load(path: Path) -> Config:
+    """The config of a run, as `save` wrote it."""
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
+    try:
+        config = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    if not isinstance(config, dict):
+        raise ConfigError(f"cannot read {path}: no keys in it")
+    return validate(typing.cast(Config, config))
+
+
+def dump(config: Config) -> str:
+    """The config as YAML."""
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
+    return OmegaConf.to_yaml(OmegaConf.create(config))
+
+
+def parse(words: Iterable[str]) -> list[tuple[str, Any]]:
+    """Keys and values of `key=value` words."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
+    from hydra.core.override_parser.types import OverrideType  # noqa: PLC0415
+    from hydra.errors import HydraException  # noqa: PLC0415
+
+    parser, pairs = OverridesParser.create(), []
+    for word in words:
+        try:
+            parsed = parser.parse_override(word)
+        except HydraException as error:
+            raise ConfigError(f"cannot read {word!r}; accepted: key=value, lists as key=[1,2]") from error
+        if parsed.type is not OverrideType.CHANGE or parsed.package or parsed.is_sweep_override():
+            raise ConfigError(f"cannot read {word!r}; accepted: key=value with one value, lists as key=[1,2]")
+        pairs.append((parsed.key_or_group, parsed.value()))
+    return pairs
+
+
+def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
+    """The config with other values at dotted keys, checked. A given length replaces the other way to say it."""
+    config = {key: dict(value) if isinstance(value, dict) else value for key, value in config.items()}
+    pairs = list(pairs)
+    lengths = {key for key, _ in pairs} & set(LENGTHS)
+    if len(lengths) == 1:
+        config |= dict.fromkeys(set(LENGTHS) - lengths)
+    for key, value in pairs:
+        head, _, tail = key.partition(".")
+        if not tail:
+            if isinstance(config.get(key), dict):
+                raise ConfigError(f"{key} = {value!r} is not possible; accepted: {key}.<field>=value")
+            config[key] = value
+        elif isinstance(config.get(head), dict):
+            config[head][tail] = value
+        else:
+            raise _unknown(key, "", config)
+    return validate(config)
+
+
+def validate(config: Config) -> Config:
+    """The same config, complete with defaults and with values of the right types; an error for what does not exist."""
+    missing = [part for part in PARTS if not isinstance(config.get(part), dict)]
+    if missing:
+        raise ConfigError(f"the config has no {missing[0]}; it needs {', '.join(PARTS)}")
+    checked = {part: _check_fields(config[part], _fields(part, config[part]), part, config) for part in PARTS}
+    rest = {key: value for key, value in config.items() if key not in PARTS}
+    return checked | _check_fields(rest, _top_fields(), "", config)
+
+
+def build(config: Config) -> "Experiment":
+    """The experiment that a config describes; a `ConfigError` says which size is impossible."""
+    from jaxswarm.networks import ActorCritic  # noqa: PLC0415
+    from jaxswarm.training import Experiment  # noqa: PLC0415
+
+    if not config["network"]["encoder"]:
+        raise ConfigError("network.encoder = [] is not possible; accepted: at least one layer, like [64]")
+    try:
+        task = build_part("task", config)
+        fields: Any = {name: tuple(x) if isinstance(x, list) else x for name, x in config["network"].items()}
+        network = ActorCritic(**fields, aggregator=build_part("aggregator", config), action_dim=task.action_dim)
+        sizes = {name: config[name] for name in _experiment_fields()}
+        return Experiment(task, network, build_part("learner", config), **sizes)
+    except ConfigError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def build_part(part: str, config: Config) -> Any:
+    """The registered class of one part, built with its fields."""
+    fields = dict(config[part])
+    try:
+        return _registries()[part][fields.pop("name")](**fields)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{part}: {error}") from error
+
+
+def run_settings(config: Config) -> Run:
+    """What the config says beyond the experiment."""
+    return Run(**{field.name: config[field.name] for field in dataclasses.fields(Run)})
+
+
+def _registries() -> dict[str, dict[str, Any]]:
+    from jaxswarm.aggregators import AGGREGATORS  # noqa: PLC0415
+    from jaxswarm.learners import LEARNERS  # noqa: PLC0415
+    from jaxswarm.tasks import TASKS  # noqa: PLC0415
+
+    return {"task": TASKS, "aggregator": AGGREGATORS, "learner": LEARNERS}
+
+
+def _fields(part: str, values: dict) -> dict[str, inspect.Parameter]:
+    """Fields that the part with these values has, its name included."""
+    if part == "network":
+        from jaxswarm.networks import ActorCritic  # noqa: PLC0415
+
+        fields = _parameters(ActorCritic)
+        del fields["aggregator"], fields["action_dim"]  # come from other parts
+        return fields
+    registry = _registries()[part]
+    if values.get("name") not in registry:
+        raise _unknown_choice(f"{part}.name", values.get("name"), list(registry))
+    name = inspect.Parameter("name", inspect.Parameter.KEYWORD_ONLY, annotation=str)
+    return {"name": name} | _parameters(registry[values["name"]])
+
+
+def _parameters(cls: Any) -> dict[str, inspect.Parameter]:
+    """Constructor parameters with resolved annotations; what flax adds to modules is left out."""
+    hints = typing.get_type_hints(cls)
+    is_module = hasattr(cls, "module_paths")
+    return {
+        name: parameter.replace(annotation=hints.get(name, parameter.annotation))
+        for name, parameter in inspect.signature(cls).parameters.items()
+        if not (is_module and name in ("parent", "name"))
+    }
+
+
+def _experiment_fields() -> dict[str, inspect.Parameter]:
+    from jaxswarm.training import Experiment  # noqa: PLC0415
+
+    return {name: field for name, field in _parameters(Experiment).items() if name not in PARTS}
+
+
+def _top_fields() -> dict[str, inspect.Parameter]:
+    return _parameters(Run) | _experiment_fields()
+
+
+def _check_fields(values: dict, fields: dict[str, inspect.Parameter], part: str, config: Config) -> dict:
+    full_name = {name: f"{part}.{name}" if part else str(name) for name in [*values, *fields]}
+    for name in values:
+        if name not in fields:
+            raise _unknown(full_name[name], part, config)
+    given = {name: _check(value, fields[name].annotation, full_name[name]) for name, value in values.items()}
+    defaults = {name: field.default for name, field in fields.items() if name not in given}
+    missing = [name for name, default in defaults.items() if default is inspect.Parameter.empty]
+    if missing:
+        raise ConfigError(f"{full_name[missing[0]]} is missing")
+    return given | {name: list(x) if isinstance(x, tuple) else x for name, x in defaults.items()}
+
+
+def _unknown(key: str, prefix: str, config: Config) -> ConfigError:
+    """The error for a key that does not exist; lists those that do beside it."""
+    fields = {part: [f"{part}.{name}" for name in _fields(part, config[part])] for part in PARTS}
+    top = [*choices(), *_top_fields()]
+    every = [*itertools.chain(*fields.values()), *top]
+    same_leaf = [name for name in every if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    accepted = fields[prefix] if prefix else [*top, *(f"{part}.<field>" for part in PARTS)]
+    return ConfigError(f"unknown key {key!r}; {_nearest(key, same_leaf or every)}accepted: {', '.join(accepted)}")
+
+
+def _choice(group: str, value: Any, accepted: list[str]) -> str:
+    if value not in accepted:
+        raise _unknown_choice(group, value, accepted)
+    return value
+
+
+def _unknown_choice(group: str, value: Any, accepted: list[str]) -> ConfigError:
+    near = _nearest(str(value), accepted)
+    return ConfigError(f"{group} = {value!r} does not exist; {near}accepted: {', '.join(accepted)}")
+
+
+def _nearest(word: str, accepted: list[str]) -> str:
+    near = difflib.get_close_matches(word, accepted, n=1, cutoff=0.5 if "." not in word else 0.3)
+    return f"did you mean {near[0]!r}? " if near else ""
+
+
+def _check(value: Any, annotation: Any, name: str) -> Any:
+    """The value as that type; integers pass for floats, nothing else passes for anything else."""
+    for accepted in _members(annotation):
+        if accepted is float and isinstance(value, int | float) and type(value) is not bool and math.isfinite(value):
+            return float(value)
+        if accepted in (bool, int, str, types.NoneType) and type(value) is accepted:
+            return value
+        if typing.get_origin(accepted) is typing.Literal and value in typing.get_args(accepted):
+            return value
+        if typing.get_origin(accepted) is tuple and isinstance(value, list | tuple):
+            element = typing.get_args(accepted)[0]
+            elements = [_check(x, element, f"{name}[{i}]") for i, x in enumerate(value)]
+            if element is not int or min(elements, default=1) >= 1:  # integers in lists are sizes
+                return elements
+    hint = f" (write {int(value)})" if isinstance(value, float) and value.is_integer() else ""
+    raise ConfigError(f"{name} = {value!r} is not possible; accepted: {_describe(annotation)}{hint}")
+
+
+def _members(annotation: Any) -> tuple:
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if is_union else (annotation,)
+
+
+def _describe(annotation: Any) -> str:
+    words = {bool: "true, false", int: "an integer, like 8", float: "a number, like 1e-3", str: "text"}
+    described = []
+    for accepted in _members(annotation):
+        if typing.get_origin(accepted) is typing.Literal:
+            described += [str(x) for x in typing.get_args(accepted)]
+        elif typing.get_origin(accepted) is tuple:
+            described.append("a list of integers from 1, like [120,60]")
+        elif accepted is types.NoneType:
+            described.append("null")
+        elif accepted in words:
+            described.append(words[accepted])
+    return ", ".join(described)

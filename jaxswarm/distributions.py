@@ -1,0 +1,12 @@
+"""The action distribution: the one place that imports distrax."""
+
+import distrax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Policy = distrax.MultivariateNormalDiag
+
+
+def gaussian(mean: Float[Array, "*batch dim"], log_std: Float[Array, "*#batch dim"]) -> Policy:
+    """Diagonal Gaussian with mean and log standard deviation."""
+    return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))

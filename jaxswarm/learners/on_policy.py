@@ -1,0 +1,184 @@
+"""What on-policy learners share: values, advantages, samples, and descent by minibatches.
+
+Every agent's step is a sample of its own, with the common reward and that agent's own value. Samples are numbered
+[steps, worlds, agents] in this order.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxswarm.rollout import Trajectory
+from jaxswarm.types import Key, Metrics, Observation, pytree
+
+Params = Any
+
+
+@pytree
+class LearnerState:
+    """Parameters of the network and of the optimiser."""
+
+    params: Params
+    optimizer_state: optax.OptState
+
+
+@pytree
+class Batch:
+    """Samples to learn from, one row each."""
+
+    obs: Observation
+    action: Float[Array, "rows action_dim"]
+    log_prob: Float[Array, " rows"]  # of the action under the policy that took it
+    advantage: Float[Array, " rows"]
+    target: Float[Array, " rows"]  # for the value
+
+
+@pytree
+class Samples:
+    """All samples of a trajectory, numbered [steps, worlds, agents]; observations are recomputed from the views."""
+
+    view: Any  # [steps * worlds, ...]
+    action: Float[Array, "samples action_dim"]
+    log_prob: Float[Array, " samples"]
+    advantage: Float[Array, " samples"]
+    target: Float[Array, " samples"]
+
+
+Loss = Callable[[Params, Batch], tuple[Array, Metrics]]
+
+
+def trajectory_values(
+    network: Any, params: Params, task: Any, trajectory: Trajectory
+) -> tuple[Float[Array, "steps worlds agents"], Float[Array, "steps worlds agents"]]:
+    """Values of the state before each step, and of the state after it, before any reset."""
+
+    def value(state: Any) -> Array:
+        return network.apply(params, jax.vmap(task.observe)(state), method="value")
+
+    values = jax.lax.map(value, trajectory.state)
+    last = value(jax.tree.map(lambda x: x[-1], trajectory.final_state))
+    following = jnp.concatenate([values[1:], last[None]])
+
+    def value_after(step: tuple) -> Array:
+        """Where no episode ended, the state after this step is the one before the next."""
+        is_done, final_state, following = step
+        return jax.lax.cond(is_done.any(), lambda: value(final_state), lambda: following)
+
+    is_done = trajectory.terminated | trajectory.truncated
+    return values, jax.lax.map(value_after, (is_done, trajectory.final_state, following))
+
+
+def generalized_advantages(
+    reward: Float[Array, "steps worlds"],
+    is_terminal: Bool[Array, "steps worlds"],
+    is_done: Bool[Array, "steps worlds"],
+    value: Float[Array, "steps worlds agents"],
+    next_value: Float[Array, "steps worlds agents"],
+    discount: Float[Array, ""] | float,
+    gae_lambda: Float[Array, ""] | float,
+) -> Float[Array, "steps worlds agents"]:
+    """Generalised advantage estimates (Schulman et al., 2016).
+
+    `is_terminal` steps have no value after them; `is_done` steps end an episode, so nothing flows back across them.
+    """
+    delta = reward[..., None] + discount * jnp.where(is_terminal[..., None], 0.0, next_value) - value
+    decay = discount * gae_lambda * (1.0 - is_done[..., None])
+
+    def backwards(advantage: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, decay = step
+        advantage = delta + decay * advantage
+        return advantage, advantage
+
+    return jax.lax.scan(backwards, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
+
+
+def stored_samples(
+    task: Any,
+    trajectory: Trajectory,
+    advantage: Float[Array, "steps worlds agents"],
+    target: Float[Array, "steps worlds agents"],
+) -> Samples:
+    """All samples of a trajectory."""
+    views = jax.vmap(jax.vmap(task.view))(trajectory.state)
+    arrays = (trajectory.action, trajectory.log_prob, advantage, target)
+    return Samples(jax.tree.map(_merge, views), *[_merge(_merge(x)) for x in arrays])
+
+
+def fetch_agents(task: Any, samples: Samples, sample: Int[Array, " rows"]) -> Batch:
+    """The samples of these numbers."""
+    view = jax.tree.map(lambda x: x[sample // task.num_agents], samples.view)
+    return _batch(samples, sample, jax.vmap(task.perceive)(view, sample % task.num_agents))
+
+
+def fetch_worlds(task: Any, samples: Samples, world: Int[Array, " worlds"]) -> Batch:
+    """The samples of all agents of the worlds of these numbers."""
+    agent = jnp.arange(task.num_agents)
+    view = jax.tree.map(lambda x: x[world], samples.view)
+    obs = jax.vmap(jax.vmap(task.perceive, (None, 0)), (0, None))(view, agent)
+    return _batch(samples, _merge(world[:, None] * task.num_agents + agent[None]), jax.tree.map(_merge, obs))
+
+
+FETCH = {"agents": fetch_agents, "worlds": fetch_worlds}
+
+
+def _batch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) -> Batch:
+    arrays = (samples.action, samples.log_prob, samples.advantage, samples.target)
+    return Batch(obs, *[x[sample] for x in arrays])
+
+
+def _merge(x: Array) -> Array:
+    """The two leading axes in one."""
+    return x.reshape(-1, *x.shape[2:])
+
+
+def shuffled(key: Key, num_rows: int, num_columns: int) -> Int[Array, "rows columns"]:
+    """The numbers below rows * columns in pseudo-random order: a Feistel network with random tables.
+
+    Luby and Rackoff (1988) show why a few rounds suffice. Sorting, which is what `jax.random.permutation` does, took
+    a fifth of the time of an update on CPU; this takes less than a hundredth.
+    """
+    row, column = jnp.divmod(jnp.arange(num_rows * num_columns), num_columns)
+    for round_key in jax.random.split(key, 4):
+        row_key, column_key = jax.random.split(round_key)
+        row = (row + jax.random.randint(row_key, (num_columns,), 0, num_rows)[column]) % num_rows
+        column = (column + jax.random.randint(column_key, (num_rows,), 0, num_columns)[row]) % num_columns
+    return (row * num_columns + column).reshape(num_rows, num_columns)
+
+
+def descend(
+    key: Key,
+    loss: Loss,
+    fetch: Callable[[Int[Array, " units"]], Batch],
+    optimizer: optax.GradientTransformation,
+    state: LearnerState,
+    num_units: int,
+    num_minibatches: int,
+    num_epochs: int,
+) -> tuple[LearnerState, Metrics]:
+    """Minibatch gradient descent; each epoch goes through all units once, in a fresh random order.
+
+    The metrics are means over all minibatches.
+    """
+
+    def minibatch(state: LearnerState, units: Int[Array, " units"]) -> tuple[LearnerState, Metrics]:
+        gradient, metrics = jax.grad(loss, has_aux=True)(state.params, fetch(units))
+        updates, optimizer_state = optimizer.update(gradient, state.optimizer_state, state.params)
+        metrics["gradient_norm"] = optax.tree.norm(gradient)
+        return LearnerState(optax.apply_updates(state.params, updates), optimizer_state), metrics
+
+    def epoch(state: LearnerState, key: Key) -> tuple[LearnerState, Metrics]:
+        order = shuffled(key, num_minibatches, num_units // num_minibatches)
+        state, metrics = jax.lax.scan(minibatch, state, order)
+        return state, jax.tree.map(jnp.mean, metrics)
+
+    state, metrics = jax.lax.scan(epoch, state, jax.random.split(key, num_epochs))
+    return state, jax.tree.map(jnp.mean, metrics)
+
+
+def explained_variance(value: Float[Array, "..."], target: Float[Array, "..."]) -> Float[Array, ""]:
+    """1 for perfect values, 0 for a constant, negative for worse; NaN if there is nothing to explain."""
+    return 1.0 - jnp.var(target - value) / jnp.var(target)

@@ -1,0 +1,143 @@
+"""Worlds stepped by a policy, many at once: the only place where tasks and networks meet.
+
+Axes are [steps, worlds, agents, ...]. Trajectories hold states, not observations: a state is O(agents) large, the
+observations of all its agents are O(agents^2), and recomputing them where they are needed is faster than fetching them.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxswarm.types import Key, Metrics, Observation, Step, pytree
+
+PolicyFn = Callable[[Observation], Any]  # to a `distributions.Policy`
+
+
+@pytree
+class Trajectory:
+    """What the learner gets; `final_state` is the state after the step, before any reset."""
+
+    state: Any
+    action: Float[Array, "steps worlds agents action_dim"]  # as sampled, not clipped
+    log_prob: Float[Array, "steps worlds agents"]
+    reward: Float[Array, "steps worlds"]
+    terminated: Bool[Array, "steps worlds"]
+    truncated: Bool[Array, "steps worlds"]
+    final_state: Any
+
+
+@pytree
+class Worlds:
+    """Worlds in the middle of their episodes, with the sums of the episodes so far."""
+
+    state: Any
+    episode_return: Float[Array, " worlds"]
+    episode_length: Int[Array, " worlds"]
+    is_whole: Bool[Array, " worlds"]  # the episode was seen from its start
+
+
+def start(key: Key, task: Any, num_worlds: int, is_desynchronised: bool) -> Worlds:
+    """Fresh worlds; desynchronised ones start at a random time of an episode whose return then counts nowhere."""
+    reset_key, time_key = jax.random.split(key)
+    state = jax.vmap(task.reset)(jax.random.split(reset_key, num_worlds))
+    if is_desynchronised:
+        state = state.replace(time=jax.random.randint(time_key, (num_worlds,), 0, task.episode_length))
+    is_whole = jnp.full((num_worlds,), not is_desynchronised)
+    return Worlds(state, jnp.zeros(num_worlds), jnp.zeros(num_worlds, jnp.int32), is_whole)
+
+
+def collect(
+    key: Key, task: Any, policy: PolicyFn, worlds: Worlds, num_steps: int, reset_pool: int
+) -> tuple[Worlds, Trajectory, Metrics]:
+    """Steps all worlds `num_steps` times with sampled actions; finished ones restart.
+
+    Start states are drawn once per call, `reset_pool` for each world; a world that restarts more often within one
+    call uses them again. The metrics are means over the episodes that were completed, NaN where there were none.
+    """
+    num_worlds = worlds.episode_return.shape[0]
+    pool_key, step_key = jax.random.split(key)
+    reset_keys = jax.random.split(pool_key, (reset_pool, num_worlds))
+    pool = jax.vmap(jax.vmap(task.reset))(reset_keys)
+
+    def step(carry: tuple, key: Key) -> tuple:
+        worlds, num_resets, totals = carry
+        action_key, world_key = jax.random.split(key)
+        distribution = policy(jax.vmap(task.observe)(worlds.state))
+        action = distribution.sample(seed=action_key)
+        final_state, outcome = _step_worlds(world_key, task, worlds.state, action)
+        transition = Trajectory(
+            worlds.state,
+            action,
+            distribution.log_prob(action),
+            outcome.reward,
+            outcome.terminated,
+            outcome.truncated,
+            final_state,
+        )
+        is_done = outcome.terminated | outcome.truncated
+        episode_return = worlds.episode_return + outcome.reward
+        episode_length = worlds.episode_length + 1
+        counts = (is_done & worlds.is_whole).astype(jnp.float32)
+        completed = (counts, counts * episode_return, counts * episode_length)
+        totals = jax.tree.map(lambda total, x: total + x.sum(), totals, completed)
+        start_state = jax.tree.map(lambda x: x[num_resets % reset_pool, jnp.arange(num_worlds)], pool)
+        worlds = Worlds(
+            jax.vmap(_select)(is_done, start_state, final_state),
+            jnp.where(is_done, 0.0, episode_return),
+            jnp.where(is_done, 0, episode_length),
+            worlds.is_whole | is_done,
+        )
+        return (worlds, num_resets + is_done, totals), transition
+
+    carry = (worlds, jnp.zeros(num_worlds, jnp.int32), (jnp.zeros(()),) * 3)
+    carry, trajectory = jax.lax.scan(step, carry, jax.random.split(step_key, num_steps))
+    worlds, _, (episodes, returns, lengths) = carry
+    metrics = {"episodes": episodes, "return": returns / episodes, "episode_length": lengths / episodes}
+    return worlds, trajectory, metrics
+
+
+def evaluate(key: Key, task: Any, policy: PolicyFn, num_worlds: int) -> Metrics:
+    """One whole episode in each of fresh worlds with the mean action: undiscounted returns and the task's own metrics.
+
+    The task's metrics are averaged over the steps of an episode, then over episodes; `final_...` is the last step's.
+    """
+    reset_key, step_key = jax.random.split(key)
+    state = jax.vmap(task.reset)(jax.random.split(reset_key, num_worlds))
+
+    def step(carry: tuple, key: Key) -> tuple:
+        state, is_running, totals, final = carry
+        action = policy(jax.vmap(task.observe)(state)).mean()
+        state, outcome = _step_worlds(key, task, state, action)
+        now = outcome.metrics | {"return": outcome.reward, "episode_length": jnp.ones(num_worlds)}
+        totals = jax.tree.map(lambda total, x: total + jnp.where(is_running, x, 0.0), totals, now)
+        final = jax.vmap(_select)(is_running, outcome.metrics, final)
+        return (state, is_running & ~(outcome.terminated | outcome.truncated), totals, final), None
+
+    outcome = jax.eval_shape(lambda: _step_worlds(step_key, task, state, _zero_action(task, num_worlds))[1])
+    zeros = {name: jnp.zeros(num_worlds) for name in outcome.metrics}
+    totals = zeros | {"return": jnp.zeros(num_worlds), "episode_length": jnp.zeros(num_worlds)}
+    carry = (state, jnp.ones(num_worlds, bool), totals, zeros)
+    (_, _, totals, final), _ = jax.lax.scan(step, carry, jax.random.split(step_key, task.episode_length))
+    returns, length = totals.pop("return"), totals.pop("episode_length")
+    return (
+        {"return": returns.mean(), "return_std": returns.std(), "episode_length": length.mean()}
+        | {name: (total / length).mean() for name, total in totals.items()}
+        | {f"final_{name}": x.mean() for name, x in final.items()}
+    )
+
+
+def _step_worlds(key: Key, task: Any, state: Any, action: Float[Array, "worlds agents action_dim"]) -> tuple[Any, Step]:
+    """One step of every world; actions are clipped to the action box here."""
+    keys = jax.random.split(key, action.shape[0])
+    return jax.vmap(task.step)(keys, state, jnp.clip(action, -1.0, 1.0))
+
+
+def _zero_action(task: Any, num_worlds: int) -> Float[Array, "worlds agents action_dim"]:
+    return jnp.zeros((num_worlds, task.num_agents, task.action_dim))
+
+
+def _select(condition: Bool[Array, ""], on_true: Any, on_false: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), on_true, on_false)

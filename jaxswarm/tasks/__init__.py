@@ -1,0 +1,5 @@
+"""The tasks, by name."""
+
+from jaxswarm.tasks.rendezvous import Rendezvous
+
+TASKS = {"rendezvous": Rendezvous}

@@ -1,0 +1,149 @@
+"""The whole training loop as one compiled program: rollouts, updates and evaluations.
+
+`train` is a pure function of an experiment and a state, without host callbacks, so that `jax.vmap` runs it over seeds
+(states from several keys) and over every number of the experiment that fixes no shape.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from jaxswarm import rollout
+from jaxswarm.learners.on_policy import LearnerState
+from jaxswarm.networks import ActorCritic
+from jaxswarm.rollout import PolicyFn, Worlds
+from jaxswarm.types import Key, Metrics, is_whole, pytree, require, static
+
+
+@pytree
+class Experiment:
+    """All that defines a run but its seed. One update takes `num_steps` steps in each of `num_worlds` worlds.
+
+    Every `eval_every` updates, before the update, the deterministic policy plays one episode in each of `eval_worlds`
+    separate worlds. With `desynchronised_start` each world begins at a random time of its first episode, so that
+    worlds do not move in lockstep. `reset_pool` start states are drawn per world and update.
+    """
+
+    task: Any
+    network: ActorCritic = static()
+    learner: Any
+    num_worlds: int = static(default=32)
+    num_steps: int = static(default=128)
+    eval_worlds: int = static(default=20)
+    eval_every: int = static(default=10)
+    desynchronised_start: bool = static(default=True)
+    reset_pool: int = static(default=1)
+
+    def __post_init__(self) -> None:
+        sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every", "reset_pool")
+        require(self, "whole numbers from 1", is_whole(1), *sizes)
+        self._check_batch_size()
+
+    def _check_batch_size(self) -> None:
+        samples, batch_size = self.agent_steps_per_update, self.learner.batch_size
+        unit = 1 if self.learner.minibatch == "agents" else self.task.num_agents
+        if samples % batch_size or batch_size % unit:
+            divisors = [n for n in range(unit, samples + 1, unit) if samples % n == 0 and n > 1]
+            nearest = sorted(sorted(divisors, key=lambda n: abs(n - batch_size))[:4])
+            raise ValueError(
+                f"batch_size = {batch_size} is not possible; accepted: divisors of num_worlds * num_steps * "
+                f"num_agents = {samples} that are multiples of {unit}, for instance {', '.join(map(str, nearest))}"
+            )
+
+    @property
+    def agent_steps_per_update(self) -> int:
+        """Environment steps of all agents in one update."""
+        return self.num_worlds * self.num_steps * self.task.num_agents
+
+
+@pytree
+class TrainState:
+    """All that changes during a run. Random numbers are functions of `key` and `update` alone."""
+
+    update: Int[Array, ""]  # updates done
+    key: Key
+    learner: LearnerState
+    worlds: Worlds
+
+
+def init(experiment: Experiment, key: Key) -> TrainState:
+    """State before the first update."""
+    run_key, params_key, obs_key, worlds_key = jax.random.split(key, 4)
+    obs = experiment.task.observe(experiment.task.reset(obs_key))
+    params = experiment.network.init(params_key, obs)
+    worlds = rollout.start(worlds_key, experiment.task, experiment.num_worlds, experiment.desynchronised_start)
+    return TrainState(jnp.zeros((), jnp.int32), run_key, experiment.learner.init(params), worlds)
+
+
+@partial(jax.jit, static_argnames="num_updates")
+def train(experiment: Experiment, train_state: TrainState, num_updates: int) -> tuple[TrainState, Metrics]:
+    """`num_updates` updates; the metrics have one row per update, NaN in `eval/...` where no evaluation was due.
+
+    n calls with 1 update give the same bits as 1 call with n.
+    """
+    return train_chunk(experiment, train_state, num_updates, num_updates)
+
+
+def train_chunk(
+    experiment: Experiment, train_state: TrainState, num_updates: int | Int[Array, ""], size: int
+) -> tuple[TrainState, Metrics]:
+    """`train` for a number of updates that is not known when compiling, at most `size`; the other rows are NaN."""
+    shapes = jax.eval_shape(_evaluate_and_update, experiment, train_state)[1]
+    rows = {name: jnp.full((size,), jnp.nan) for name in shapes}
+
+    def body(i: Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
+        state, metrics = _evaluate_and_update(experiment, carry[0])
+        return state, {name: carry[1][name].at[i].set(x) for name, x in metrics.items()}
+
+    # A trip count that XLA knows would let it compile single updates in another way, with other rounding.
+    num_updates = jax.lax.optimization_barrier(jnp.asarray(num_updates, jnp.int32))
+    return jax.lax.fori_loop(0, num_updates, body, (train_state, rows))
+
+
+def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
+    """Evaluates the deterministic policy; the worlds depend on the number of updates done, not on the training."""
+    key = jax.random.fold_in(_update_key(train_state), 0)
+    policy = _policy(experiment, train_state.learner)
+    metrics = rollout.evaluate(key, experiment.task, policy, experiment.eval_worlds)
+    return {f"eval/{name}": x for name, x in metrics.items()}
+
+
+def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[TrainState, Metrics]:
+    eval_metrics = _evaluate_if(state.update % experiment.eval_every == 0, experiment, state)
+    rollout_key, learner_key = jax.random.split(jax.random.fold_in(_update_key(state), 1))
+    worlds, trajectory, train_metrics = rollout.collect(
+        rollout_key,
+        experiment.task,
+        _policy(experiment, state.learner),
+        state.worlds,
+        experiment.num_steps,
+        experiment.reset_pool,
+    )
+    learner, learner_metrics = experiment.learner.update(
+        learner_key, state.learner, experiment.network, experiment.task, trajectory
+    )
+    metrics = eval_metrics | {f"train/{name}": x for name, x in train_metrics.items()}
+    metrics |= {f"learner/{name}": x for name, x in learner_metrics.items()}
+    return TrainState(state.update + 1, state.key, learner, worlds), metrics
+
+
+def _evaluate_if(is_due: Bool[Array, ""], experiment: Experiment, state: TrainState) -> Metrics:
+    """Evaluates, or gives NaN. A loop of at most one pass, because `vmap` would turn a `cond` into doing both."""
+    shapes = jax.eval_shape(evaluate, experiment, state)
+    skipped = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
+
+    def body(_: tuple) -> tuple[Array, Metrics]:
+        return jnp.zeros((), bool), evaluate(experiment, state)
+
+    return jax.lax.while_loop(lambda carry: carry[0], body, (is_due, skipped))[1]
+
+
+def _update_key(state: TrainState) -> Key:
+    return jax.random.fold_in(state.key, state.update)
+
+
+def _policy(experiment: Experiment, learner: LearnerState) -> PolicyFn:
+    return partial(experiment.network.apply, learner.params, method="policy")

@@ -1,0 +1,201 @@
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxswarm import checkpoint, cli, reporting
+from jaxswarm import config as configs
+from jaxswarm.fit import abstract_state
+
+TINY = [
+    *("task.num_agents=3", "task.episode_length=5", "num_worlds=2", "num_steps=4", "learner.batch_size=12"),
+    *("eval_worlds=2", "eval_every=3", "network.encoder=[4]", "network.decoder=[4]", "seed=5"),
+]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A compile cache for this module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        yield
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+@pytest.fixture(scope="module")
+def finished(cache, tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("runs") / "finished"
+    assert cli.train([*TINY, "num_updates=4", f"run_dir={run_dir}"]) == 0
+    return run_dir
+
+
+def test_training_ends_with_its_files_and_the_next_command(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.train([*TINY, "num_updates=4"]) == 0
+    out = capsys.readouterr().out
+    (run_dir,) = (tmp_path / "runs").iterdir()
+    assert run_dir.name.startswith("rendezvous-mean-ppo-")
+    names = {"config.yaml", "manifest.json", "metrics.csv", "checkpoints", "curve.png"}
+    assert {path.name for path in run_dir.iterdir()} == names
+    assert all(f"{run_dir.relative_to(tmp_path)}/{name}" in out for name in names)
+    assert out.splitlines()[-1].startswith("next: jaxswarm-eval runs/rendezvous-mean-ppo-")
+    same = [reporting.read_rows(path / "metrics.csv") for path in (run_dir, finished)]
+    assert [row["eval/return"] for row in same[0]] == [row["eval/return"] for row in same[1]]
+    assert {row["seed"] for row in same[0]} == {5}
+
+
+def test_what_was_compiled_is_kept_for_the_next_start(finished):
+    assert jax.config.jax_compilation_cache_dir == os.path.join(os.environ["XDG_CACHE_HOME"], "jaxswarm", "xla")
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 0
+
+
+def test_a_run_folder_is_never_overwritten(finished, capsys):
+    assert cli.train([*TINY, f"run_dir={finished}"]) == 2
+    assert f"resume={finished}" in capsys.readouterr().err
+
+
+def test_resuming_a_finished_run_says_so(finished, capsys):
+    assert cli.train([f"resume={finished}"]) == 0
+    assert "is finished: 4 of 4 updates" in capsys.readouterr().out
+
+
+def test_a_finished_run_can_be_made_longer(finished, capsys):
+    assert cli.train([f"resume={finished}", "num_updates=5"]) == 0
+    assert [row["update"] for row in reporting.read_rows(finished / "metrics.csv")] == [0, 3, 5]
+    assert "num_updates: 5" in (finished / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["num_updates=2"], ["2 updates", "4 updates or more"]),
+        (["learner.learning_rate=1"], ["learner.learning_rate cannot be changed here", "num_updates=N"]),
+        (["run_dir=x"], ["one of run_dir and resume"]),
+    ],
+)
+def test_nothing_but_the_length_changes_on_resume(finished, capsys, words, parts):
+    parts = [part.replace("4 updates", "5 updates") for part in parts]
+    assert cli.train([f"resume={finished}", "num_updates=5"]) == 0
+    assert cli.train([f"resume={finished}", *words]) == 2
+    err = capsys.readouterr().err
+    assert all(part in err for part in parts), err
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["task.num_agent=5"], ["did you mean 'task.num_agents'"]),
+        (["learner.batch_size=7"], ["batch_size = 7", "divisors"]),
+        (["num_worlds=0"], ["num_worlds = 0"]),
+        (["--verbose"], ["'--verbose'", "key=value"]),
+        (["run_dir="], ["run_dir has no value"]),
+        (["resume=nowhere"], ["nowhere is not a run folder"]),
+    ],
+)
+def test_a_wrong_command_is_one_line_and_writes_nothing(tmp_path, monkeypatch, capsys, words, parts):
+    monkeypatch.chdir(tmp_path)
+    assert cli.train(words) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert all(part in captured.err for part in parts), captured.err
+    assert not captured.out
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_shows_groups_choices_and_keys(capsys):
+    assert cli.train(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_worlds: 32", "resume=PATH"))
+    assert cli.evaluate(["-h"]) == 0
+    assert "task.num_agents=50" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [[], ["checkpoint=last", "task.num_agents=7", "episodes=3"]])
+def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, words):
+    assert cli.evaluate([str(finished), "seed=1", *words]) == 0
+    out = capsys.readouterr().out
+    path = out.splitlines()[-1].removeprefix("wrote ")
+    result = json.loads(Path(path).read_text())
+    assert result["task"]["num_agents"] == (7 if words else 3)
+    assert result["episodes"] == (3 if words else 2)
+    assert f"{result['metrics']['return']:.4f}" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["checkpoint=first"], "accepted: best, last"),
+        (["episodes=0"], "episodes = 0"),
+        (["episodes=many"], "episodes = many"),
+        (["num_worlds=3"], "num_worlds cannot be changed here"),
+        (["task.num_agent=3"], "did you mean 'task.num_agents'"),
+        (["task.num_agents=0"], "num_agents = 0"),
+        (["task.dynamics=velocity"], "observations of other sizes"),
+        (["another"], "give one run folder"),
+    ],
+)
+def test_a_wrong_evaluation_is_one_line(finished, capsys, words, part):
+    assert cli.evaluate([str(finished), *words]) == 2
+    err = capsys.readouterr().err
+    assert part in err
+    assert err.count("\n") == 1
+
+
+def test_a_folder_without_a_run_cannot_be_evaluated(tmp_path, capsys):
+    assert cli.evaluate([str(tmp_path)]) == 2
+    assert "is not a run folder" in capsys.readouterr().err
+
+
+def start(*words):
+    program = "import sys; from jaxswarm import cli; sys.exit(cli.train(sys.argv[1:]))"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, "-c", program, *map(str, words)], **pipes)
+
+
+def table(run_dir):
+    """All of metrics.csv but the time."""
+    with open(run_dir / "metrics.csv", newline="") as file:
+        return [{name: x for name, x in row.items() if name != "wall_seconds"} for row in csv.DictReader(file)]
+
+
+def wait_for_rows(process, run_dir, num_rows):
+    while process.poll() is None and len(reporting.read_rows(run_dir / "metrics.csv")) < num_rows:
+        time.sleep(0.005)
+    assert process.poll() is None, process.communicate()
+
+
+@pytest.mark.slow
+def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(cache, tmp_path):
+    words = [*TINY, "num_updates=3000", "checkpoint_seconds=0.05"]
+    undisturbed, run_dir = tmp_path / "undisturbed", tmp_path / "run"
+    assert cli.train([*words, f"run_dir={undisturbed}"]) == 0
+    process = start(*words, f"run_dir={run_dir}")
+    for num_rows, number, code in ((50, signal.SIGKILL, -9), (200, signal.SIGKILL, -9), (400, signal.SIGTERM, 0)):
+        wait_for_rows(process, run_dir, num_rows)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=120)
+        assert process.returncode == code, (out, err)
+        assert "Traceback" not in err
+        if number == signal.SIGTERM:
+            assert f"continue with: jaxswarm-train resume={run_dir}" in out
+        process = start(f"resume={run_dir}")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, (out, err)
+    compiled = list(Path(os.environ["XDG_CACHE_HOME"], "jaxswarm", "xla").glob("jit_train_chunk*-cache"))
+    assert compiled
+    assert table(run_dir) == table(undisturbed)
+    template = abstract_state(configs.build(configs.load(run_dir / "config.yaml")))
+    states = [checkpoint.restore(path / "checkpoints", template) for path in (undisturbed, run_dir)]
+    assert [state.update for state in states] == [3000, 3000]
+    for a, b in zip(*(jax.tree.leaves(state.train_state.learner) for state in states), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,0 +1,136 @@
+import dataclasses
+
+import pytest
+
+from jaxswarm import config as configs
+from jaxswarm.config import ConfigError
+
+
+@pytest.mark.parametrize(
+    "word", [f"{group}={choice}" for group, names in configs.choices().items() for choice in names]
+)
+def test_every_file_of_every_group_builds(word):
+    config = configs.compose([word])
+    for part in configs.REGISTERED:
+        configs.build_part(part, config)
+
+
+@pytest.mark.parametrize("network", configs.choices()["network"])
+def test_every_network_builds_an_experiment(network):
+    assert configs.build(configs.compose([f"network={network}"])).network.encoder
+
+
+def test_groups_are_found_from_any_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert configs.compose(["network=medium"])["network"]["encoder"] == [120, 60]
+
+
+def test_words_reach_the_experiment():
+    words = ["aggregator=bayesian", "learner.learning_rate=1e-2", "task.num_agents=5", "task.side=50", "num_worlds=8"]
+    experiment = configs.build(configs.compose([*words, "learner.batch_size=80", "network.encoder=[7,8]"]))
+    assert type(experiment.network.aggregator).__name__ == "Bayesian"
+    assert (experiment.learner.learning_rate, experiment.learner.batch_size) == (0.01, 80)
+    assert (experiment.task.num_agents, experiment.num_worlds, experiment.network.encoder) == (5, 8, (7, 8))
+    assert isinstance(experiment.task.side, float)  # an integer leaf would be another program
+
+
+def test_the_thesis_setting_has_the_thesis_arithmetic():
+    config = configs.compose(["experiment=rendezvous_thesis"])
+    experiment = configs.build(config)
+    learner, per_update = experiment.learner, experiment.agent_steps_per_update
+    assert per_update == 164_000
+    assert configs.run_settings(config).length(per_update) * per_update == 26_240_000
+    assert per_update // learner.batch_size * learner.num_epochs == 1640
+    assert (learner.learning_rate, learner.adam_epsilon, learner.bootstrap_truncation) == (3e-4, 1e-5, False)
+    assert experiment.task.relative_velocity == "thesis"
+
+
+def test_words_win_over_an_experiment():
+    config = configs.compose(["experiment=rendezvous_thesis", "learner=ppo", "num_worlds=16", "total_agent_steps=5"])
+    assert config["learner"]["minibatch"] == "worlds"
+    assert (config["num_worlds"], config["num_updates"], config["total_agent_steps"]) == (16, None, 5)
+
+
+def test_a_length_in_agent_steps_is_rounded_up():
+    assert [configs.Run(total_agent_steps=n).length(100) for n in (1, 100, 101)] == [1, 1, 2]
+
+
+def test_a_written_config_reads_back_the_same(tmp_path):
+    config = configs.compose(["aggregator=bayesian", "aggregator.prior_mean=null", "learner.learning_rate=1e-5"])
+    (tmp_path / "config.yaml").write_text(configs.dump(config))
+    assert configs.load(tmp_path / "config.yaml") == config
+
+
+def test_fields_that_no_file_mentions_get_their_defaults():
+    config = configs.compose()
+    del config["task"]["side"], config["reset_pool"]
+    checked = configs.validate(config)
+    assert checked["task"]["side"] == 100.0
+    assert "reset_pool" in checked
+
+
+@pytest.mark.parametrize(
+    ("word", "parts"),
+    [
+        ("taks=rendezvous", ["'taks'", "did you mean 'task'"]),
+        ("num_world=3", ["did you mean 'num_worlds'", "num_steps"]),
+        ("learning_rate=3", ["did you mean 'learner.learning_rate'"]),
+        ("learner.learning_rat=3", ["did you mean 'learner.learning_rate'", "learner.clip_range"]),
+        ("seed.x=3", ["'seed.x'"]),
+        ("task=rendevous", ["did you mean 'rendezvous'", "accepted: rendezvous"]),
+        ("learner=x", ["'x'", "accepted: ppo, ppo_thesis"]),
+        ("task.name=x", ["task.name", "'x'", "rendezvous"]),
+        ("learner.learning_rate=fast", ["learner.learning_rate", "'fast'", "a number"]),
+        ("learner.learning_rate=nan", ["nan", "a number"]),
+        ("num_worlds=2.5", ["num_worlds", "2.5", "an integer"]),
+        ("num_worlds=true", ["True", "an integer"]),
+        ("total_agent_steps=1e6", ["an integer", "write 1000000"]),
+        ("task.torus=1", ["task.torus", "true, false"]),
+        ("network.activation=gelu", ["'gelu'", "leaky_relu, relu, tanh"]),
+        ("network.encoder=64", ["64", "a list of integers"]),
+        ("network.encoder=[a]", ["network.encoder[0]", "an integer"]),
+        ("network.decoder=[64,0]", ["network.decoder = [64, 0]", "integers from 1"]),
+        ("network.encoder=[]", ["network.encoder = []", "at least one layer"]),
+        ("task={a: 1}", ["task"]),
+        ("foo", ["'foo'", "key=value"]),
+        ("seed=1,2", ["'seed=1,2'", "one value"]),
+        ("+seed=1", ["'+seed=1'", "key=value"]),
+        ("~seed", ["'~seed'", "key=value"]),
+        ("num_worlds=0", ["num_worlds = 0"]),
+        ("task.num_agents=0", ["num_agents = 0"]),
+        ("task.visibility_radius=-1", ["visibility_radius = -1.0"]),
+        ("learner.batch_size=77", ["batch_size = 77", "divisors"]),
+        ("learner.batch_size=1000000", ["batch_size = 1000000"]),
+        ("seed=-1", ["seed = -1"]),
+        ("num_updates=0", ["num_updates = 0"]),
+        ("keep_checkpoints=0", ["keep_checkpoints = 0"]),
+    ],
+)
+def test_what_is_wrong_is_named_in_one_line_with_what_is_accepted(word, parts):
+    def use():
+        config = configs.compose([word])
+        configs.run_settings(config)
+        configs.build(config)
+
+    with pytest.raises(ConfigError) as caught:
+        use()
+    message = str(caught.value)
+    assert all(part in message for part in parts), message
+    assert "\n" not in message
+
+
+def test_two_lengths_at_once_are_refused():
+    config = configs.compose(["num_updates=3", "total_agent_steps=4"])
+    with pytest.raises(ConfigError, match="one of num_updates and total_agent_steps"):
+        configs.run_settings(config)
+
+
+def test_run_settings_are_the_keys_beside_the_experiment():
+    run = configs.run_settings(configs.compose(["seed=7", "num_updates=3", "checkpoint_seconds=1"]))
+    assert dataclasses.asdict(run) == {
+        "seed": 7,
+        "num_updates": 3,
+        "total_agent_steps": None,
+        "checkpoint_seconds": 1.0,
+        "keep_checkpoints": 3,
+    }

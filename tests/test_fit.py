@@ -1,0 +1,179 @@
+"""One tiny experiment, compiled once; every run of it has to end in the same bits."""
+
+import csv
+import shutil
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+import jaxswarm
+from jaxswarm import checkpoint, config, reporting
+from jaxswarm import fit as fitting
+from jaxswarm.fit import DivergedError, fit
+
+WORDS = (
+    "task.num_agents=3 task.episode_length=5 num_worlds=2 num_steps=4 learner.batch_size=12 eval_worlds=2 eval_every=3 "
+    "network.encoder=[4] network.decoder=[4]"
+)
+EXPERIMENT = config.build(config.compose(WORDS.split()))
+NUM_UPDATES = 8
+OPTIONS = {"progress": False, "checkpoint_seconds": 0.0}
+
+
+class Killed(BaseException):
+    """Stands for a death that nothing can catch."""
+
+
+def assert_same_state(found, expected):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        if jax.numpy.issubdtype(a.dtype, jax.dtypes.prng_key):
+            a, b = jax.random.key_data(a), jax.random.key_data(b)  # noqa: PLW2901
+        np.testing.assert_array_equal(a, b)
+
+
+def table(run_dir):
+    """All of metrics.csv but the time."""
+    with open(run_dir / "metrics.csv", newline="") as file:
+        return [{name: x for name, x in row.items() if name != "wall_seconds"} for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("run") / "undisturbed"
+    return *fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, **OPTIONS), run_dir
+
+
+def assert_resumes_to_the_same(run_dir, undisturbed):
+    state, rows = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, resume=True, **OPTIONS)
+    assert_same_state(state, undisturbed[0])
+    assert table(run_dir) == table(undisturbed[2])
+    assert [row["update"] for row in rows] == [0, 3, 6, 8]
+
+
+def test_chunks_are_the_single_program_bit_by_bit(undisturbed):
+    state, rows, _ = undisturbed
+    expected, metrics = jaxswarm.train(EXPERIMENT, jaxswarm.init(EXPERIMENT, jax.random.key(3)), NUM_UPDATES)
+    assert_same_state(state, expected)
+    metrics = jax.device_get(metrics)
+    assert [row["update"] for row in rows] == [0, 3, 6, 8]
+    assert [row["agent_steps"] for row in rows] == [0, 72, 144, 192]
+    for name, values in metrics.items():
+        found = [row[name] for row in rows]
+        if name.startswith("eval/"):
+            np.testing.assert_array_equal(np.float32(found[:3]), values[[0, 3, 6]])
+        else:
+            means = [np.nan, *(np.mean(x[~np.isnan(x)].astype(float)) for x in (values[:3], values[3:6], values[6:]))]
+            np.testing.assert_allclose(found, means, rtol=1e-12)
+
+
+def test_the_last_row_evaluates_the_final_policy(undisturbed):
+    state, rows, _ = undisturbed
+    expected = jaxswarm.evaluate(EXPERIMENT, state)
+    np.testing.assert_allclose(rows[-1]["eval/return"], expected["eval/return"], rtol=1e-5)
+
+
+def test_the_run_folder_is_complete(undisturbed):
+    run_dir = undisturbed[2]
+    assert {path.name for path in run_dir.iterdir()} == {"manifest.json", "metrics.csv", "checkpoints", "curve.png"}
+    seconds = [row["wall_seconds"] for row in reporting.read_rows(run_dir / "metrics.csv")]
+    assert seconds == sorted(seconds)
+    best = max(undisturbed[1], key=lambda row: row["eval/return"])
+    restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT), "best")
+    assert (restored.update, np.float32(restored.score)) == (best["update"], np.float32(best["eval/return"]))
+
+
+def test_chunks_of_any_length_give_the_same(undisturbed, tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "SECONDS_PER_CHUNK", 0.0)
+    state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=tmp_path / "run", **OPTIONS)
+    assert_same_state(state, undisturbed[0])
+    assert table(tmp_path / "run") == table(undisturbed[2])
+
+
+def test_without_a_folder_nothing_is_written(undisturbed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    state, rows = fit(EXPERIMENT, NUM_UPDATES, seed=3, progress=False)
+    assert_same_state(state, undisturbed[0])
+    assert [row["eval/return"] for row in rows] == [row["eval/return"] for row in undisturbed[1]]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("first", [2, 3, 5])
+def test_a_run_that_is_made_longer_is_the_long_run(undisturbed, tmp_path, first):
+    fit(EXPERIMENT, first, seed=3, run_dir=tmp_path / "run", **OPTIONS)
+    assert_resumes_to_the_same(tmp_path / "run", undisturbed)
+
+
+@pytest.mark.parametrize("died_at", [0, 1, 2, 3])
+@pytest.mark.parametrize("checkpoint_seconds", [0.0, 1e9])
+def test_a_killed_run_resumes_to_the_same_end(undisturbed, tmp_path, monkeypatch, died_at, checkpoint_seconds):
+    rows_written = []
+
+    def append_half_a_row(path, row):
+        if len(rows_written) == died_at:
+            with open(path, "a") as file:
+                file.write(f"{row['update']},1")
+            raise Killed
+        rows_written.append(append_row(path, row))
+
+    append_row, run_dir = reporting.append_row, tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(reporting, "append_row", append_half_a_row)
+        patch.setattr(fitting._Recorder, "close", lambda self: self._checkpoints and self._checkpoints.close())
+        options = OPTIONS | {"checkpoint_seconds": checkpoint_seconds}
+        with pytest.raises(Killed):
+            fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, **options)
+    assert_resumes_to_the_same(run_dir, undisturbed)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_after_a_checkpoint(undisturbed, tmp_path, monkeypatch, number):
+    run_dir, handlers = tmp_path / "run", [signal.getsignal(number)]
+    append_row = reporting.append_row
+
+    def interrupted(path, row):
+        append_row(path, row)
+        if row["update"] == 0:
+            signal.raise_signal(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(reporting, "append_row", interrupted)
+        state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, **(OPTIONS | {"checkpoint_seconds": 1e9}))
+    assert 0 < int(state.update) < NUM_UPDATES
+    assert signal.getsignal(number) == handlers[0]
+    restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT))
+    assert restored.update == int(state.update)
+    assert_resumes_to_the_same(run_dir, undisturbed)
+
+
+def test_a_damaged_checkpoint_costs_updates_and_no_bits(undisturbed, tmp_path, capsys):
+    run_dir = shutil.copytree(undisturbed[2], tmp_path / "run")
+    for file in (run_dir / "checkpoints" / "8" / "state").rglob("d/*"):
+        file.write_bytes(b"")
+    assert_resumes_to_the_same(run_dir, undisturbed)
+    assert "8 is damaged" in capsys.readouterr().out
+
+
+def test_a_finished_run_is_left_alone(undisturbed):
+    state, rows, run_dir = undisturbed
+    before = (run_dir / "metrics.csv").read_bytes()
+    again = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, resume=True, **OPTIONS)
+    assert_same_state(again[0], state)
+    assert [row["update"] for row in again[1]] == [row["update"] for row in rows]
+    assert (run_dir / "metrics.csv").read_bytes() == before
+
+
+def test_another_run_is_never_overwritten(undisturbed):
+    with pytest.raises(FileExistsError, match="resume"):
+        fit(EXPERIMENT, NUM_UPDATES, run_dir=undisturbed[2], **OPTIONS)
+
+
+def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkpoint(tmp_path):
+    run_dir = tmp_path / "run"
+    fit(EXPERIMENT, 3, run_dir=run_dir, **OPTIONS)
+    diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
+    with pytest.raises(DivergedError, match=r"is (nan|inf) at update \d"):
+        fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)
+    restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(restored.train_state.learner.params))

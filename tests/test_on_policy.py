@@ -1,0 +1,108 @@
+"""Advantages against their definition, values across resets, and the shuffling of samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from probes import PROBES
+
+from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, rollout
+from jaxswarm.learners import on_policy
+
+
+def advantages_by_definition(reward, is_terminal, is_done, value, next_value, discount, gae_lambda):
+    """Sum of discounted temporal differences up to the end of the episode."""
+    result = np.zeros_like(value)
+    for t in range(len(reward)):
+        weight = 1.0
+        for u in range(t, len(reward)):
+            following = np.where(is_terminal[u], 0.0, next_value[u])
+            result[t] += weight * (reward[u] + discount * following - value[u])
+            if is_done[u]:
+                break
+            weight *= discount * gae_lambda
+    return result
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1), discount=st.floats(0, 1), gae_lambda=st.floats(0, 1))
+def test_advantages_are_sums_of_temporal_differences(seed, discount, gae_lambda):
+    rng = np.random.default_rng(seed)
+    reward, value, next_value = rng.normal(size=(3, 12))
+    is_done = rng.random(12) < 0.3
+    is_terminal = is_done & (rng.random(12) < 0.5)
+    args = (reward[:, None], is_terminal[:, None], is_done[:, None], value[:, None, None], next_value[:, None, None])
+    result = ADVANTAGES(*[jnp.asarray(x, jnp.float32 if x.dtype != bool else bool) for x in args], discount, gae_lambda)
+    expected = advantages_by_definition(reward, is_terminal, is_done, value, next_value, discount, gae_lambda)
+    np.testing.assert_allclose(result[:, 0, 0], expected, atol=1e-4)
+
+
+ADVANTAGES = jax.jit(on_policy.generalized_advantages)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 7), (4, 1), (2, 8), (164, 1000), (3, 5)])
+def test_shuffling_is_a_permutation(rows, columns):
+    order = on_policy.shuffled(jax.random.key(0), rows, columns)
+    np.testing.assert_array_equal(np.sort(order.reshape(-1)), np.arange(rows * columns))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(2, 16), (16, 16), (40, 10)])
+def test_every_sample_is_as_likely_in_every_minibatch(rows, columns):
+    num_draws = 2000
+    keys = jax.random.split(jax.random.key(1), num_draws)
+    order = jax.jit(jax.vmap(lambda key: on_policy.shuffled(key, rows, columns)))(keys).reshape(num_draws, -1)
+    minibatch = np.argsort(np.asarray(order), axis=1) // columns  # of each sample
+    assert np.abs((minibatch == 0).mean(0) - 1 / rows).max() < 5 / np.sqrt(rows * num_draws)
+    together = (minibatch[:, :1] == minibatch).mean(0)[1:]  # with sample 0: neighbours are no more alike than others
+    assert np.abs(together - (columns - 1) / (rows * columns - 1)).max() < 5 / np.sqrt(rows * num_draws)
+
+
+def random_trajectory(task, num_steps=6, num_worlds=3):
+    network = ActorCritic(encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["mean"](), action_dim=1)
+    params = network.init(jax.random.key(0), task.observe(task.reset(jax.random.key(0))))
+    worlds = rollout.start(jax.random.key(1), task, num_worlds, is_desynchronised=False)
+    policy = lambda obs: network.apply(params, obs, method="policy")  # noqa: E731
+    _, trajectory, metrics = rollout.collect(jax.random.key(2), task, policy, worlds, num_steps, reset_pool=2)
+    return network, params, trajectory, metrics
+
+
+def test_values_after_a_step_are_those_of_the_state_before_any_reset():
+    task = PROBES["delayed reward"]
+    network, params, trajectory, _ = random_trajectory(task)
+    values, next_values = on_policy.trajectory_values(network, params, task, trajectory)
+    observe = jax.vmap(jax.vmap(task.observe))
+    expected = network.apply(params, observe(trajectory.state), method="value")
+    np.testing.assert_allclose(values, expected, atol=1e-6)
+    expected = network.apply(params, observe(trajectory.final_state), method="value")
+    np.testing.assert_allclose(next_values, expected, atol=1e-6)
+
+
+def test_fetched_samples_are_those_of_the_trajectory():
+    task = PROBES["delayed reward"]
+    _, _, trajectory, _ = random_trajectory(task)
+    steps, worlds, agents = trajectory.log_prob.shape
+    number = jnp.arange(steps * worlds * agents, dtype=jnp.float32).reshape(steps, worlds, agents)
+    samples = on_policy.stored_samples(task, trajectory, number, -number)
+    batch = on_policy.fetch_agents(task, samples, jnp.array([5, 0, 33]))
+    np.testing.assert_array_equal(batch.advantage, [5, 0, 33])
+    np.testing.assert_array_equal(batch.log_prob, trajectory.log_prob.reshape(-1)[jnp.array([5, 0, 33])])
+    obs = jax.vmap(jax.vmap(task.observe))(trajectory.state)
+    np.testing.assert_allclose(batch.obs.own[2], obs.own.reshape(-1, 2)[33])
+    batch = on_policy.fetch_worlds(task, samples, jnp.array([7, 2]))
+    np.testing.assert_array_equal(batch.target, [-14, -15, -4, -5])
+    np.testing.assert_allclose(batch.obs.groups["neighbors"].features[1, 0], obs.own[2, 1, 0])
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_impossible_hyper_parameters_are_named(learner):
+    for field, value in {
+        "learning_rate": -1.0,
+        "discount": 1.5,
+        "num_epochs": 0,
+        "batch_size": 0,
+        "minibatch": "x",
+    }.items():
+        with pytest.raises(ValueError, match=f"{field} = {value!r} is not possible; accepted: "):
+            LEARNERS[learner](**{field: value})

@@ -1,0 +1,99 @@
+"""The recorded update of the original trainer is reproduced."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from golden_weights import cases, network, observation, params, weights
+
+from jaxswarm.learners import on_policy
+from jaxswarm.learners.on_policy import Batch
+from jaxswarm.learners.ppo import PPO
+
+AGGREGATION = {
+    "mean": {"type": "Mean"},
+    "bayes": {
+        "type": "Bayesian",
+        "learnable_mu_z_0": "one_per_dim",
+        "learnable_sigma_z_0": "one_per_dim",
+        "variance_rectifier": "softplus",
+        "output_variance": False,
+    },
+}
+
+
+def complete(meta):
+    """The recorded updates leave out what all of them share."""
+    layout = meta["layout"] | {"order": ["local", "aggregatables"]}
+    common = {"agg_mode": AGGREGATION[meta["agg"]], "agg_into_space": "separate", "out_hidden": []}
+    return meta | common | {"layout": layout}
+
+
+CASES = [(complete(meta), arrays) for meta, arrays in cases("ppo.npz") if meta["agg"] in ("mean", "bayes")]
+by_case = pytest.mark.parametrize(("meta", "arrays"), CASES, ids=[meta["agg"] for meta, _ in CASES])
+
+
+def recorded_advantages(meta, arrays):
+    """Advantages from the recorded values; the original stores whether an observation is the first of its episode."""
+    is_done = np.concatenate([arrays["episode_start"][1:], arrays["last_done"][None]]).astype(bool)
+    next_value = np.concatenate([arrays["values"][1:], arrays["last_values"][None]])
+    value, next_value = arrays["values"][..., None], next_value[..., None]  # every agent is a world of its own there
+    advantage = on_policy.generalized_advantages(
+        arrays["rewards"], is_done, is_done, value, next_value, meta["gamma"], meta["gae_lambda"]
+    )
+    return advantage[..., 0]
+
+
+@by_case
+def test_recorded_advantages(meta, arrays):
+    advantage = recorded_advantages(meta, arrays)
+    np.testing.assert_allclose(advantage, arrays["advantages"], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(advantage + arrays["values"], arrays["returns"], rtol=1e-5, atol=1e-4)
+
+
+@by_case
+def test_recorded_update(meta, arrays):
+    learner = PPO(
+        learning_rate=meta["learning_rate"],
+        clip_range=meta["clip_range"],
+        value_coefficient=meta["vf_coef"],
+        entropy_coefficient=meta["ent_coef"],
+        max_gradient_norm=meta["max_grad_norm"],
+        adam_epsilon=meta["adam_eps"],
+        num_epochs=meta["n_epochs"],
+        batch_size=meta["batch_size"],
+    )
+    model = network(meta)
+    before, after = (params(meta, weights(arrays, f"{w}/")) for w in ("w0", "w1"))
+
+    def flat(x):
+        return jnp.asarray(x).reshape(-1, *x.shape[2:])
+
+    obs = jax.tree.map(flat, observation(meta, arrays["obs"]))
+    batch = Batch(obs, *[flat(arrays[name]) for name in ("actions", "log_probs", "advantages", "returns")])
+
+    @jax.jit
+    def update(state):
+        loss = lambda params, batch: learner.loss(model, params, batch)  # noqa: E731
+        fetch = lambda order: jax.tree.map(lambda x: x[order], batch)  # noqa: E731
+        optimizer = learner._optimizer()
+        return on_policy.descend(
+            jax.random.key(0), loss, fetch, optimizer, state, meta["batch_size"], 1, meta["n_epochs"]
+        )
+
+    state, metrics = update(learner.init(before))
+    deviation = jnp.concatenate(
+        [jnp.abs(a - b).reshape(-1) for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after), strict=True)]
+    )
+    moved = jnp.concatenate(
+        [jnp.abs(a - b).reshape(-1) for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)]
+    )
+    assert moved.max() > 2e-4  # something was learned
+    assert (deviation > 1e-5 * meta["n_epochs"]).mean() < 0.01  # gradients near zero may flip the first step of Adam
+    logged = meta["logged"]
+    assert float(metrics["value_loss"]) == pytest.approx(logged["train/value_loss"], rel=1e-4)
+    assert float(metrics["policy_loss"]) == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(-logged["train/entropy_loss"], rel=1e-5)
+    assert float(metrics["approx_kl"]) == pytest.approx(logged["train/approx_kl"], abs=1e-6)
+    explained = on_policy.explained_variance(arrays["values"], arrays["returns"])
+    assert float(explained) == pytest.approx(logged["train/explained_variance"], abs=1e-3)

@@ -1,0 +1,104 @@
+"""Rollouts: restarts, truncation, and the statistics of whole episodes, on a task where all of it is known."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxswarm import rollout
+from jaxswarm.distributions import gaussian
+from jaxswarm.types import Entities, Observation, Step, pytree, static
+
+
+@pytree
+class Clock:
+    start: jax.Array
+    time: jax.Array
+
+
+@pytree
+class Ticking:
+    """One agent; reward 1 + action in each step; episodes end by themselves after `length` steps or by the limit."""
+
+    length: int = 100
+    num_agents: int = static(default=1)
+    episode_length: int = static(default=4)
+    action_dim: ClassVar[int] = 1
+
+    def reset(self, key):
+        return Clock(jax.random.uniform(key), jnp.zeros((), jnp.int32))
+
+    def step(self, key, state, action):
+        state = state.replace(time=state.time + 1)
+        is_late = state.time >= self.episode_length
+        metrics = {"time": state.time.astype(jnp.float32)}
+        return state, Step(1 + action[0, 0], state.time >= self.length, is_late, metrics)
+
+    def observe(self, state):
+        group = Entities(jnp.zeros((1, 0, 1)), jnp.zeros((1, 0), bool))
+        return Observation(state.time.astype(jnp.float32).reshape(1, 1), {"neighbors": group})
+
+
+def policy(mean):
+    return lambda obs: gaussian(jnp.full((*obs.own.shape[:-1], 1), mean), jnp.full((1, 1, 1), -20.0))
+
+
+@pytest.fixture(scope="module")
+def collected():
+    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronised=False)
+    return rollout.collect(jax.random.key(1), Ticking(), policy(0.0), worlds, 10, reset_pool=2)
+
+
+def test_worlds_restart_after_the_last_step(collected):
+    worlds, trajectory, _ = collected
+    np.testing.assert_array_equal(trajectory.state.time[:, 0], [0, 1, 2, 3, 0, 1, 2, 3, 0, 1])
+    np.testing.assert_array_equal(trajectory.truncated[:, 0], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(trajectory.final_state.time[:, 0], [1, 2, 3, 4, 1, 2, 3, 4, 1, 2])
+    np.testing.assert_array_equal(worlds.state.time, 2)
+
+
+def test_start_states_are_fresh(collected):
+    _, trajectory, _ = collected
+    starts = trajectory.state.start[jnp.array([0, 4, 8])].reshape(-1)
+    assert len(np.unique(starts)) == 9
+
+
+def test_only_whole_episodes_are_counted(collected):
+    _, _, metrics = collected
+    assert metrics["episodes"] == 6
+    np.testing.assert_allclose(metrics["return"], 4.0, rtol=1e-5)
+    np.testing.assert_allclose(metrics["episode_length"], 4.0)
+    worlds = rollout.start(jax.random.key(0), Ticking(), 50, is_desynchronised=True)
+    _, trajectory, metrics = rollout.collect(jax.random.key(1), Ticking(), policy(0.0), worlds, 4, reset_pool=1)
+    assert trajectory.truncated.sum() == 50
+    assert metrics["episodes"] == (worlds.state.time == 0).sum() * 0  # those began at an unknown time
+    assert np.isnan(metrics["return"])
+
+
+def test_episodes_go_on_across_rollouts(collected):
+    worlds, _, _ = collected
+    _, trajectory, metrics = rollout.collect(jax.random.key(2), Ticking(), policy(0.0), worlds, 3, reset_pool=1)
+    np.testing.assert_array_equal(trajectory.state.time[:, 0], [2, 3, 0])
+    np.testing.assert_allclose(metrics["return"], 4.0, rtol=1e-5)
+
+
+def test_actions_are_clipped_for_the_world_only():
+    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronised=False)
+    _, trajectory, _ = rollout.collect(jax.random.key(1), Ticking(), policy(3.0), worlds, 2, reset_pool=1)
+    np.testing.assert_allclose(trajectory.action, 3.0, rtol=1e-5)
+    np.testing.assert_allclose(trajectory.reward, 2.0)
+
+
+@pytest.mark.parametrize(("length", "steps"), [(100, 4), (2, 2)])
+def test_evaluation_plays_one_whole_episode_in_each_world(length, steps):
+    metrics = rollout.evaluate(jax.random.key(0), Ticking(length), policy(0.5), 3)
+    expected = {
+        "return": 1.5 * steps,
+        "return_std": 0.0,
+        "episode_length": steps,
+        "time": (steps + 1) / 2,
+        "final_time": steps,
+    }
+    assert {name: float(x) for name, x in metrics.items()} == pytest.approx(expected)

@@ -1,0 +1,181 @@
+"""What every task promises."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxswarm.tasks import TASKS
+from jaxswarm.types import Observation
+
+NUM_AGENTS, EPISODE_LENGTH, NUM_WORLDS = 4, 6, 3
+KEY = jax.random.key(1)
+
+
+@pytest.fixture(params=TASKS)
+def task(request):
+    return TASKS[request.param](num_agents=NUM_AGENTS, episode_length=EPISODE_LENGTH)
+
+
+@jax.jit
+def reset(task, key):
+    return task.reset(key)
+
+
+@jax.jit
+def step(task, key, state, action):
+    return task.step(key, state, action)
+
+
+@jax.jit
+def observe(task, state):
+    return task.observe(state)
+
+
+def random_actions(task, *axes):
+    return jax.random.uniform(KEY, (*axes, task.num_agents, task.action_dim), minval=-1)
+
+
+def describe(tree):
+    return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def assert_close(a, b, atol=1e-6):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=atol), a, b)
+
+
+def number_fields(task):
+    return [field.name for field in dataclasses.fields(task) if isinstance(getattr(task, field.name), float)]
+
+
+def test_states_keep_their_shapes_and_types(task):
+    state = reset(task, KEY)
+    after, _ = step(task, KEY, state, random_actions(task))
+    assert describe(after) == describe(state)
+    assert state.time == 0
+    assert after.time == 1
+
+
+def test_steps_are_scalars(task):
+    _, outcome = step(task, KEY, reset(task, KEY), random_actions(task))
+    assert describe(outcome.reward) == ((), jnp.float32)
+    assert describe(outcome.terminated) == describe(outcome.truncated) == ((), jnp.bool)
+    assert outcome.metrics
+    assert all(metric.shape == () for metric in outcome.metrics.values())
+
+
+def test_observations_have_an_own_part_and_masked_groups(task):
+    obs = observe(task, reset(task, KEY))
+    assert isinstance(obs, Observation)
+    assert obs.own.shape[0] == NUM_AGENTS
+    assert obs.own.dtype == jnp.float32
+    for group in obs.groups.values():
+        assert group.features.shape[:2] == group.mask.shape
+        assert group.features.shape[0] == NUM_AGENTS
+        assert group.features.dtype == jnp.float32
+        assert group.mask.dtype == jnp.bool
+
+
+@pytest.mark.parametrize("num_agents", [2, 9])
+def test_any_number_of_agents_gives_features_of_the_same_size(task, num_agents):
+    other = task.replace(num_agents=num_agents)
+    obs, other_obs = observe(task, reset(task, KEY)), observe(other, reset(other, KEY))
+    assert other_obs.own.shape == (num_agents, obs.own.shape[1])
+    sizes, other_sizes = (
+        {name: group.features.shape[-1] for name, group in o.groups.items()} for o in (obs, other_obs)
+    )
+    assert other_sizes == sizes
+
+
+def test_everything_stays_finite(task):
+    state, actions = reset(task, KEY), random_actions(task, 50)
+    for action in actions:
+        state, outcome = step(task, KEY, state, action)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, outcome, observe(task, state))))
+
+
+def test_the_time_limit_truncates_at_exactly_the_episode_length(task):
+    state, truncated = reset(task, KEY), []
+    for _ in range(EPISODE_LENGTH):
+        state, outcome = step(task, KEY, state, random_actions(task))
+        truncated.append(bool(outcome.truncated))
+    assert truncated == [False] * (EPISODE_LENGTH - 1) + [True]
+
+
+def test_one_agent_perceives_what_all_observe(task):
+    state = reset(task, KEY)
+    view, obs, perceive = jax.jit(task.view)(state), observe(task, state), jax.jit(task.perceive)
+    assert all(leaf.shape[0] == NUM_AGENTS for leaf in jax.tree.leaves(view))
+    for agent in range(NUM_AGENTS):
+        assert_close(perceive(view, jnp.array(agent)), jax.tree.map(lambda leaf, i=agent: leaf[i], obs))
+
+
+def test_observations_are_functions_of_the_state(task):
+    state, _ = step(task, KEY, reset(task, KEY), random_actions(task))
+    assert_equal(observe(task, state), observe(task, state.replace(time=state.time + 3)))
+
+
+def test_worlds_are_batched_by_vmap(task):
+    keys = jax.random.split(KEY, NUM_WORLDS)
+    actions = random_actions(task, NUM_WORLDS)
+    starts = jax.vmap(reset, (None, 0))(task, keys)
+    states, steps = jax.vmap(step, (None, 0, 0, 0))(task, keys, starts, actions)
+    all_obs = jax.vmap(observe, (None, 0))(task, states)
+    for world in range(NUM_WORLDS):
+        state, outcome = step(task, keys[world], reset(task, keys[world]), actions[world])
+        expected = state, outcome, observe(task, state)
+        assert_close(jax.tree.map(lambda leaf, i=world: leaf[i], (states, steps, all_obs)), expected, atol=1e-5)
+
+
+def test_compiled_steps_are_those_of_plain_python(task):
+    start, action = reset(task, KEY), random_actions(task)
+    with jax.disable_jit():
+        plain = task.step(KEY, start, action)
+    assert_close(step(task, KEY, start, action), plain, atol=1e-5)
+
+
+def test_numbers_are_leaves_to_be_mapped_over(task):
+    names = number_fields(task)
+    assert "side" in names
+    assert len(jax.tree.leaves(task)) == len(names)
+
+    def play(task):
+        state, outcome = step(task, KEY, reset(task, KEY), random_actions(task))
+        return outcome, observe(task, state)
+
+    for name in names:
+        values = getattr(task, name) * jnp.array([0.5, 1.0])
+        outcomes = jax.vmap(lambda value, name=name: play(task.replace(**{name: value})))(values)
+        assert_close(jax.tree.map(lambda leaf: leaf[1], outcomes), play(task), atol=1e-5)
+
+
+def test_trees_of_tasks_can_be_rebuilt(task):
+    assert jax.tree.map(lambda leaf: leaf, task) == task
+    assert jax.eval_shape(lambda task: task, task).num_agents == NUM_AGENTS
+
+
+@jax.jit
+def slope(task, position, offset):
+    """Gradient of all that is seen and rewarded, in a world with agents at `position + offset`, and one step later."""
+
+    def total(offset):
+        start = task.reset(KEY).replace(position=position + offset)
+        after, outcome = task.step(KEY, start, random_actions(task))
+        floats = (task.observe(start), task.observe(after), outcome.reward)
+        return sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(floats))
+
+    return jax.grad(total)(offset)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e-20, 1e-3])
+@pytest.mark.parametrize("corner", [0.0, 1.0])
+def test_gradients_are_finite_even_between_agents_at_one_place(task, distance, corner):
+    shape = (NUM_AGENTS, 2)
+    offset = distance * jnp.broadcast_to(jnp.arange(NUM_AGENTS, dtype=jnp.float32)[:, None], shape)
+    assert jnp.isfinite(slope(task, jnp.full(shape, corner), offset)).all()

@@ -1,0 +1,138 @@
+"""The training program: the same bits in any chunks, side by side over seeds and numbers, evaluations apart."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxswarm
+from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
+from jaxswarm.training import train_chunk
+
+TASK = jaxswarm.make("rendezvous", num_agents=3, episode_length=6)
+NETWORK = ActorCritic(encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["bayesian"]())
+LEARNER = LEARNERS["ppo"](num_epochs=2, batch_size=12)
+SIZES = {"num_worlds": 2, "num_steps": 4, "eval_worlds": 2, "eval_every": 2}
+EXPERIMENT = Experiment(TASK, NETWORK, LEARNER, **SIZES)
+init = jax.jit(jaxswarm.init)
+
+
+@pytest.fixture(scope="module")
+def run():
+    state = init(EXPERIMENT, jax.random.key(0))
+    return state, *jaxswarm.train(EXPERIMENT, state, 5)
+
+
+def assert_same_bits(one, two):
+    def check(a, b):
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            a, b = jax.random.key_data(a), jax.random.key_data(b)
+        np.testing.assert_array_equal(a, b)
+
+    jax.tree.map(check, one, two)
+
+
+def test_single_updates_and_one_call_give_the_same_bits(run):
+    state, expected, expected_metrics = run
+    rows = []
+    for _ in range(5):
+        state, metrics = jaxswarm.train(EXPERIMENT, state, 1)
+        rows.append(metrics)
+    assert_same_bits(state, expected)
+    assert_same_bits(jax.tree.map(lambda *x: jnp.concatenate(x), *rows), expected_metrics)
+
+
+def test_chunks_of_any_length_share_one_program_and_give_the_same_bits(run):
+    state, expected, expected_metrics = run
+    chunk = jax.jit(train_chunk, static_argnames="size", donate_argnames="train_state")
+    state, first = chunk(EXPERIMENT, jax.tree.map(jnp.copy, state), 3, size=3)
+    state, second = chunk(EXPERIMENT, state, 2, size=3)
+    assert chunk._cache_size() == 1
+    assert_same_bits(state, expected)
+    rows = {name: np.concatenate([first[name], second[name][:2]]) for name in first}
+    assert_same_bits(rows, expected_metrics)
+    assert all(np.isnan(x[2]) for x in second.values())
+
+
+def test_evaluations_are_due_before_every_second_update(run):
+    _, _, metrics = run
+    assert metrics.keys() >= {"eval/return", "eval/distance", "train/return", "learner/approx_kl"}
+    np.testing.assert_array_equal(np.isfinite(metrics["eval/return"]), [True, False, True, False, True])
+
+
+def test_evaluation_does_not_change_training(run):
+    state, expected, _ = run
+    without = EXPERIMENT.replace(eval_every=1000)
+    assert_same_bits(jaxswarm.train(without, state, 5)[0], expected)
+
+
+def test_the_program_evaluates_as_the_function_does(run):
+    state, _, metrics = run
+    for name, value in jax.jit(jaxswarm.evaluate)(EXPERIMENT, state).items():
+        np.testing.assert_allclose(value, metrics[name][0], rtol=1e-5)
+
+
+def test_seeds_side_by_side_equal_single_runs(run):
+    _, expected, expected_metrics = run
+    keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
+    states = jax.vmap(jaxswarm.init, (None, 0))(EXPERIMENT, keys)
+    states, metrics = jax.vmap(lambda state: jaxswarm.train(EXPERIMENT, state, 5))(states)
+    one, two = (jax.tree.leaves(x.learner.params) for x in (jax.tree.map(lambda x: x[0], states), expected))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    np.testing.assert_array_equal(np.isnan(metrics["eval/return"][0]), np.isnan(expected_metrics["eval/return"]))
+    assert not np.allclose(metrics["eval/return"][0, 0], metrics["eval/return"][1, 0])
+
+
+def test_every_number_that_fixes_no_shape_can_be_swept():
+    leaves = jax.tree.leaves(EXPERIMENT)
+    assert all(isinstance(x, float) for x in leaves)
+    state = init(EXPERIMENT, jax.random.key(0))
+
+    def final_params(number, index):
+        swept = [x if i != index else number for i, x in enumerate(leaves)]
+        experiment = jax.tree.unflatten(jax.tree.structure(EXPERIMENT), swept)
+        state_after, _ = jaxswarm.train(experiment, state, 1)
+        return state_after.learner.params["params"]["actor"]["neighbors_encoder"]["kernel"]
+
+    rate = leaves.index(LEARNER.learning_rate)
+    params = jax.vmap(final_params, (0, None))(jnp.array([0.0, 1e-3]), rate)
+    np.testing.assert_array_equal(params[0], state.learner.params["params"]["actor"]["neighbors_encoder"]["kernel"])
+    assert not np.allclose(params[0], params[1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_worlds": 0}, r"num_worlds = 0 is not possible; accepted: whole numbers from 1"),
+        ({"num_steps": 2.5}, r"num_steps = 2.5 is not possible"),
+        ({"eval_every": -1}, r"eval_every = -1 is not possible"),
+        (
+            {"learner": LEARNER.replace(batch_size=18)},
+            r"batch_size = 18 .* divisors of .* = 24 that are multiples of 3",
+        ),
+        ({"learner": LEARNER.replace(batch_size=8)}, r"batch_size = 8 .* for instance 3, 6, 12, 24"),
+        ({"learner": LEARNER.replace(batch_size=48)}, r"batch_size = 48 "),
+        ({"learner": LEARNER.replace(batch_size=9, minibatch="agents")}, r"batch_size = 9 .* multiples of 1"),
+    ],
+)
+def test_impossible_sizes_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        EXPERIMENT.replace(**changes)
+
+
+def test_desynchronised_worlds_start_at_random_times():
+    experiment = Experiment(
+        TASK.replace(episode_length=1000), NETWORK, LEARNER, **SIZES | {"num_worlds": 50, "num_steps": 12}
+    )
+    assert len(np.unique(init(experiment, jax.random.key(0)).worlds.state.time)) > 40
+    experiment = experiment.replace(desynchronised_start=False)
+    np.testing.assert_array_equal(init(experiment, jax.random.key(0)).worlds.state.time, 0)
+
+
+def test_train_traces_once_for_many_calls(run):
+    state, _, _ = run
+    before = jaxswarm.train._cache_size()
+    for rate in (1e-3, 2e-3):
+        jaxswarm.train(EXPERIMENT.replace(learner=LEARNER.replace(learning_rate=rate)), state, 5)
+    assert jaxswarm.train._cache_size() == before
