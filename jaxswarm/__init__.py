@@ -2,11 +2,14 @@
 
 from typing import Any
 
-from jaxswarm.aggregators import AGGREGATORS
-from jaxswarm.learners import LEARNERS
-from jaxswarm.networks import ActorCritic
-from jaxswarm.tasks import TASKS
-from jaxswarm.training import Experiment, TrainState, evaluate, init, train
+from etils import epy
+
+with epy.lazy_api_imports(globals()):  # the command line answers before JAX is there
+    from jaxswarm.aggregators import AGGREGATORS
+    from jaxswarm.learners import LEARNERS
+    from jaxswarm.networks import ActorCritic
+    from jaxswarm.tasks import TASKS
+    from jaxswarm.training import Experiment, TrainState, evaluate, init, train
 
 __version__ = "0.1.0"
 
@@ -26,6 +29,8 @@ __all__ = [
 
 def make(name: str, **fields: Any) -> Any:
     """The task of that name, `TASKS[name](**fields)`; a `ValueError` names what there is."""
+    from jaxswarm.tasks import TASKS  # noqa: PLC0415
+
     if name not in TASKS:
         raise ValueError(f"task = {name!r} is not possible; accepted: {', '.join(TASKS)}")
     return TASKS[name](**fields)

@@ -15,6 +15,24 @@ from jaxswarm import sets
 from jaxswarm.sets import Segments
 
 
+@jax.custom_jvp
+def softplus_precision(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """1 / log(1 + exp(x)); with its derivative several times faster on CPU than by way of `jax.nn.softplus`."""
+    return 1.0 / (jnp.maximum(x, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(x))))
+
+
+@softplus_precision.defjvp
+def _softplus_precision_jvp(primals: tuple, tangents: tuple) -> tuple:
+    (x,), (dx,) = primals, tangents
+    decay = jnp.exp(-jnp.abs(x))
+    precision = 1.0 / (jnp.maximum(x, 0.0) + jnp.log1p(decay))
+    sigmoid = jnp.where(x > 0, 1.0, decay) / (1.0 + decay)
+    return precision, -precision * (precision * sigmoid) * dx
+
+
+PRECISION = {"softplus": softplus_precision, "exp": lambda x: jnp.exp(-x)}  # of what a rectifier makes of a number
+
+
 class Mean(nn.Module):
     """Arithmetic mean; the vector of an empty group is 0."""
 
@@ -66,7 +84,7 @@ class Bayesian(nn.Module):
 
     def lift(self, observation: Float[Array, "n features"], raw_variance: Float[Array, "n features"]) -> tuple:
         """Natural parameters of the Gaussian likelihood: r / s and 1 / s."""
-        precision = 1.0 / softplus(raw_variance) if self.rectifier == "softplus" else jnp.exp(-raw_variance)
+        precision = PRECISION[self.rectifier](raw_variance)
         return observation * precision, precision
 
     @nn.compact
@@ -76,25 +94,13 @@ class Bayesian(nn.Module):
         shape = {"feature": weighted.shape[-1:], "scalar": (1,)}
         if self.prior_variance is not None:
             raw = self.param("prior_variance", nn.initializers.ones, shape[self.prior_variance])
-            prior_precision = 1.0 / (softplus(raw) if self.rectifier == "softplus" else jnp.exp(raw))
+            prior_precision = PRECISION[self.rectifier](raw)
             precision = precision + prior_precision[None]
             if self.prior_mean is not None:
                 mean = self.param("prior_mean", nn.initializers.ones, shape[self.prior_mean])
                 weighted = weighted + (mean * prior_precision)[None]
         variance = jnp.where(precision > 0, 1.0 / jnp.where(precision > 0, precision, 1.0), 0.0)
         return jnp.concatenate([weighted * variance, variance], -1) if self.output_variance else weighted * variance
-
-
-@jax.custom_jvp
-def softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """log(1 + exp(x)), several times faster than `jax.nn.softplus` on CPU."""
-    return jnp.maximum(x, 0.0) + jnp.log(1.0 + jnp.exp(-jnp.abs(x)))
-
-
-@softplus.defjvp
-def _softplus_jvp(primals: tuple, tangents: tuple) -> tuple:
-    (x,), (dx,) = primals, tangents
-    return softplus(x), jax.nn.sigmoid(x) * dx
 
 
 AGGREGATORS = {"mean": Mean, "bayesian": Bayesian}

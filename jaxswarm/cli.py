@@ -1,6 +1,7 @@
 """The programs `jaxswarm-train` and `jaxswarm-eval`."""
 
 import functools
+import gc
 import json
 import os
 import shlex
@@ -44,6 +45,7 @@ def _program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | 
 
     @functools.wraps(main)
     def program(arguments: Sequence[str] | None = None) -> int:
+        gc.set_threshold(200_000)  # importing and tracing make many objects and little garbage: a tenth of the start
         try:
             return main(sys.argv[1:] if arguments is None else arguments)
         except ConfigError as error:

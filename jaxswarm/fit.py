@@ -33,7 +33,6 @@ MAX_CHUNK = 64  # updates
 
 _run_chunk = jax.jit(train_chunk, static_argnames="size", donate_argnames="train_state")
 _init = jax.jit(init)
-_evaluate = jax.jit(evaluate)
 
 
 @jax.jit
@@ -233,7 +232,7 @@ class _Recorder:
         record = {"wall_seconds": self._wall_seconds, "since_evaluation": self._since_evaluation}
         score = None
         if is_complete:
-            evaluation = {name: float(x) for name, x in _evaluate(self._experiment, train_state).items()}
+            evaluation = {name: float(x) for name, x in evaluate(self._experiment, train_state).items()}
             _check_finite({name: np.array([x]) for name, x in evaluation.items()}, update, is_evaluated=True)
             score = evaluation[RETURN]
             self._add_row(update, evaluation)

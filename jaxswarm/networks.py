@@ -13,7 +13,13 @@ from jaxswarm.aggregators import Mean
 from jaxswarm.distributions import Policy, gaussian
 from jaxswarm.types import Entities, Observation
 
-ACTIVATIONS = {"leaky_relu": partial(nn.leaky_relu, negative_slope=0.01), "relu": nn.relu, "tanh": nn.tanh}
+
+def leaky_relu(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """x, or x / 100 where it is not positive; so is the slope at 0 (`jax.nn.leaky_relu` has 1 there), as in PyTorch."""
+    return jnp.where(x > 0, x, 0.01 * x)
+
+
+ACTIVATIONS = {"leaky_relu": leaky_relu, "relu": nn.relu, "tanh": nn.tanh}
 _HIDDEN_INIT = nn.initializers.orthogonal(math.sqrt(2.0))
 
 

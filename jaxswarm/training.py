@@ -103,6 +103,7 @@ def train_chunk(
     return jax.lax.fori_loop(0, num_updates, body, (train_state, rows))
 
 
+@jax.jit
 def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
     """Evaluates the deterministic policy; the worlds depend on the number of updates done, not on the training."""
     key = jax.random.fold_in(_update_key(train_state), 0)
@@ -111,6 +112,7 @@ def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
     return {f"eval/{name}": x for name, x in metrics.items()}
 
 
+@jax.jit  # traced once, for its shapes and for the loop
 def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[TrainState, Metrics]:
     eval_metrics = _evaluate_if(state.update % experiment.eval_every == 0, experiment, state)
     rollout_key, learner_key = jax.random.split(jax.random.fold_in(_update_key(state), 1))

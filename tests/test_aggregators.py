@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxswarm import AGGREGATORS, sets
-from jaxswarm.aggregators import softplus
+from jaxswarm.aggregators import softplus_precision
 from jaxswarm.networks import Encoder
 from jaxswarm.types import Entities
 
@@ -159,7 +159,9 @@ def test_bayesian_without_evidence_is_the_prior():
     np.testing.assert_array_equal(no_prior.apply({}, jnp.ones((2, 6)), segments), 0.0)
 
 
-def test_softplus_and_its_gradient_over_the_whole_range():
-    x = jnp.concatenate([jnp.linspace(-100, 100, 401), jnp.array([0.0])])
-    np.testing.assert_allclose(softplus(x), jax.nn.softplus(x), rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(jax.vmap(jax.grad(softplus))(x), jax.nn.sigmoid(x), rtol=1e-6)
+def test_precision_of_softplus_and_its_gradient_over_the_whole_range():
+    x = jnp.concatenate([jnp.linspace(-60, 100, 401), jnp.array([0.0])])
+    variance = np.logaddexp(0, np.float64(x))
+    np.testing.assert_allclose(softplus_precision(x), 1 / variance, rtol=1e-5)
+    gradient = jax.vmap(jax.grad(softplus_precision))(x)
+    np.testing.assert_allclose(gradient, -1 / (1 + np.exp(-np.float64(x))) / variance**2, rtol=1e-5, atol=1e-37)

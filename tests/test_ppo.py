@@ -38,10 +38,8 @@ def recorded_advantages(meta, arrays):
     is_done = np.concatenate([arrays["episode_start"][1:], arrays["last_done"][None]]).astype(bool)
     next_value = np.concatenate([arrays["values"][1:], arrays["last_values"][None]])
     value, next_value = arrays["values"][..., None], next_value[..., None]  # every agent is a world of its own there
-    advantage = on_policy.generalized_advantages(
-        arrays["rewards"], is_done, is_done, value, next_value, meta["gamma"], meta["gae_lambda"]
-    )
-    return advantage[..., 0]
+    steps = [jnp.asarray(x) for x in (arrays["rewards"], is_done, is_done, value, next_value)]
+    return on_policy.generalized_advantages(*steps, meta["gamma"], meta["gae_lambda"])[..., 0]
 
 
 @by_case
@@ -82,18 +80,16 @@ def test_recorded_update(meta, arrays):
         )
 
     state, metrics = update(learner.init(before))
-    deviation = jnp.concatenate(
-        [jnp.abs(a - b).reshape(-1) for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(after), strict=True)]
-    )
-    moved = jnp.concatenate(
-        [jnp.abs(a - b).reshape(-1) for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)]
+    moved, deviation = (
+        np.concatenate([np.abs(a - b).reshape(-1) for a, b in zip(*map(jax.tree.leaves, trees), strict=True)])
+        for trees in ((before, after), (state.params, after))
     )
     assert moved.max() > 2e-4  # something was learned
-    assert (deviation > 1e-5 * meta["n_epochs"]).mean() < 0.01  # gradients near zero may flip the first step of Adam
+    assert deviation.max() < 1e-5 * meta["n_epochs"]
     logged = meta["logged"]
     assert float(metrics["value_loss"]) == pytest.approx(logged["train/value_loss"], rel=1e-4)
     assert float(metrics["policy_loss"]) == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
     assert float(metrics["entropy"]) == pytest.approx(-logged["train/entropy_loss"], rel=1e-5)
     assert float(metrics["approx_kl"]) == pytest.approx(logged["train/approx_kl"], abs=1e-6)
-    explained = on_policy.explained_variance(arrays["values"], arrays["returns"])
+    explained = on_policy.explained_variance(jnp.asarray(arrays["values"]), jnp.asarray(arrays["returns"]))
     assert float(explained) == pytest.approx(logged["train/explained_variance"], abs=1e-3)

@@ -59,17 +59,15 @@ def trajectory_values(
     def value(state: Any) -> Array:
         return network.apply(params, jax.vmap(task.observe)(state), method="value")
 
-    values = jax.lax.map(value, trajectory.state)
-    last = value(jax.tree.map(lambda x: x[-1], trajectory.final_state))
-    following = jnp.concatenate([values[1:], last[None]])
-
     def value_after(step: tuple) -> Array:
         """Where no episode ended, the state after this step is the one before the next."""
-        is_done, final_state, following = step
-        return jax.lax.cond(is_done.any(), lambda: value(final_state), lambda: following)
+        is_known, final_state, following = step
+        return jax.lax.cond(is_known, lambda: following, lambda: value(final_state))
 
-    is_done = trajectory.terminated | trajectory.truncated
-    return values, jax.lax.map(value_after, (is_done, trajectory.final_state, following))
+    values = jax.lax.map(value, trajectory.state)
+    is_known = ~(trajectory.terminated | trajectory.truncated).any(-1)
+    is_known = is_known.at[-1].set(False)
+    return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0)))
 
 
 def generalized_advantages(

@@ -24,7 +24,7 @@ class PPO:
     a time limit counts as the end of the world, as in the thesis.
     """
 
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     discount: float = 0.99
     gae_lambda: float = 0.95
     clip_range: float = 0.2
@@ -32,8 +32,8 @@ class PPO:
     entropy_coefficient: float = 0.0
     max_gradient_norm: float = 0.5
     adam_epsilon: float = 1e-5
-    num_epochs: int = static(default=4)
-    batch_size: int = static(default=5120)
+    num_epochs: int = static(default=2)
+    batch_size: int = static(default=1280)
     minibatch: Literal["agents", "worlds"] = static(default="worlds")
     bootstrap_truncation: bool = static(default=True)
 

@@ -1,0 +1,118 @@
+"""How fast a training setting compiles, steps and learns; prints one JSON object.
+
+    python benchmarks/training_throughput.py [group=choice | key=value ...] [repeats=3]
+
+takes the words of `jaxswarm-train`, for instance `experiment=rendezvous_thesis aggregator=bayesian`. `gemm_fraction` is
+the useful matrix-multiply FLOP/s of the update over those of a 2048 x 2048 float32 matrix product timed in the same
+process: recomputed activations and everything that is no matrix product count for nothing.
+"""
+
+import json
+import resource
+import statistics
+import sys
+import time
+from functools import partial
+
+import jax
+
+from jaxswarm import config, init, reporting, rollout, train
+from jaxswarm.training import Experiment, evaluate
+
+
+def useful_flops(experiment: Experiment, params: dict) -> int:
+    """Of the matrix products of one sample's forward and backward pass, each weight counted once per use.
+
+    Forward, gradient of the weights, gradient of the inputs; the last is not needed for the observation itself.
+    """
+    task = experiment.task
+    groups = jax.eval_shape(lambda: task.observe(task.reset(jax.random.key(0)))).groups
+    total = 0
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        names = [key.key for key in path]
+        if names[-1] != "kernel":
+            continue
+        inputs, outputs = leaf.shape
+        group = next((groups[name.removesuffix("_encoder")] for name in names if name.endswith("_encoder")), None)
+        uses = group.mask.shape[-1] if group else 1
+        is_first = group is not None and inputs == group.features.shape[-1]
+        total += 2 * inputs * outputs * uses * (2 if is_first else 3)
+    return total
+
+
+def seconds(function, *args, repeats: int) -> float:
+    """Median time of a call, after one that does not count."""
+    jax.block_until_ready(function(*args))
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(function(*args))
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def peak_memory() -> float:
+    """MiB: of the device where it tells, else of this process."""
+    statistics_of_device = jax.local_devices()[0].memory_stats() or {}
+    in_bytes = statistics_of_device.get("peak_bytes_in_use", 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return in_bytes / 2**20
+
+
+def main(words: list[str]) -> None:
+    repeats = next((int(word.partition("=")[2]) for word in words if word.startswith("repeats=")), 3)
+    words = [word for word in words if not word.startswith("repeats=")]
+    experiment = config.build(config.compose(words))
+    state = jax.jit(init)(experiment, jax.random.key(0))
+
+    start = time.perf_counter()
+    lowered = train.lower(experiment, state, experiment.eval_every)
+    trace_seconds = time.perf_counter() - start
+    start = time.perf_counter()
+    program = lowered.compile()
+    compile_seconds = time.perf_counter() - start
+
+    @jax.jit
+    def collect(state):
+        policy = partial(experiment.network.apply, state.learner.params, method="policy")
+        sizes = experiment.num_steps, experiment.reset_pool
+        return rollout.collect(jax.random.key(1), experiment.task, policy, state.worlds, *sizes)
+
+    @jax.jit
+    def update(state, trajectory):
+        key = jax.random.key(2)
+        return experiment.learner.update(key, state.learner, experiment.network, experiment.task, trajectory)
+
+    matrix = jax.random.normal(jax.random.key(3), (2048, 2048))
+    product = jax.jit(lambda x: x @ x)
+    before = seconds(product, matrix, repeats=9)
+    _, trajectory, _ = collect(state)
+    rollout_seconds = seconds(collect, state, repeats=repeats)
+    update_seconds = seconds(update, state, trajectory, repeats=repeats)
+    evaluate_seconds = seconds(evaluate, experiment, state, repeats=repeats)
+    loop_seconds = seconds(program, experiment, state, repeats=repeats)
+    gemm = 2 * 2048**3 / statistics.mean([before, seconds(product, matrix, repeats=9)])
+
+    steps = experiment.agent_steps_per_update
+    flops = useful_flops(experiment, state.learner.params) * steps * experiment.learner.num_epochs / update_seconds
+    manifest = reporting.manifest(experiment, experiment.eval_every, 0)
+    result = {
+        "benchmark": "training_throughput",
+        "setting": words,
+        "agent_steps_per_update": steps,
+        "trace_seconds": trace_seconds,
+        "compile_seconds": compile_seconds,
+        "rollout_agent_steps_per_second": steps / rollout_seconds,
+        "update_agent_steps_per_second": steps / update_seconds,
+        "loop_agent_steps_per_second": steps * experiment.eval_every / loop_seconds,
+        "updates_per_evaluation": experiment.eval_every,
+        "evaluation_seconds": evaluate_seconds,
+        "peak_memory_mib": peak_memory(),
+        "gemm_gflops": gemm / 1e9,
+        "gemm_fraction": flops / gemm,
+    }
+    rounded = {name: float(f"{x:.4g}") if isinstance(x, float) else x for name, x in result.items()}
+    print(json.dumps(rounded | {key: manifest[key] for key in ("versions", "device", "platform", "git_revision")}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
