@@ -5,6 +5,7 @@ import gc
 import json
 import os
 import shlex
+import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -142,7 +143,7 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
         return 0
     if rows:
         print(f"done: {update} updates, return {rows[-1]['eval/return']:.2f} (untrained {rows[0]['eval/return']:.2f})")
-    print(f"{_files(run_dir)}\nnext: jaxswarm-eval {shlex.quote(str(run_dir))} episodes=100")
+    print(f"{_files(run_dir)}\nnext: {_command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
     return 0
 
 
@@ -280,7 +281,15 @@ def _summary(config: Config, experiment: Any, num_updates: int, run_dir: Path) -
 
 
 def _resume_command(run_dir: Path) -> str:
-    return f"jaxswarm-train {shlex.quote(f'resume={run_dir}')}"
+    return _command("jaxswarm-train", f"resume={run_dir}")
+
+
+def _command(program: str, *words: str) -> str:
+    """What to type; with the folder of the program if it was called that way, from an environment not activated."""
+    folder = Path(sys.argv[0]).parent
+    if shutil.which(program) is None and (folder / program).exists():
+        program = str(folder / program)
+    return shlex.join([program, *words])
 
 
 def _files(run_dir: Path) -> str:
