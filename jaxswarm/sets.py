@@ -24,7 +24,7 @@ Summary = Any  # a pytree of arrays [receivers, ...]
 _IDENTITY = {"add": 0.0, "max": -jnp.inf}
 _COMBINE = {"add": jnp.add, "max": jnp.maximum}
 _SEGMENT = {"add": jax.ops.segment_sum, "max": jax.ops.segment_max}
-_UNROLL = 10  # slots per loop iteration of the streaming layout; measured on CPU
+_UNROLL = 10  # slots per loop iteration of the streaming layout; measured on CPU, see benchmarks/LOG.md
 
 
 @runtime_checkable
