@@ -24,8 +24,8 @@ def softplus_precision(x: Float[Array, "..."]) -> Float[Array, "..."]:
 @softplus_precision.defjvp
 def _softplus_precision_jvp(primals: tuple, tangents: tuple) -> tuple:
     (x,), (dx,) = primals, tangents
-    decay = jnp.exp(-jnp.abs(x))
-    precision = 1.0 / (jnp.maximum(x, 0.0) + jnp.log1p(decay))
+    precision = softplus_precision(x)
+    decay = jnp.exp(-jnp.abs(x))  # shared with the line above once compiled
     sigmoid = jnp.where(x > 0, 1.0, decay) / (1.0 + decay)
     return precision, -precision * (precision * sigmoid) * dx
 

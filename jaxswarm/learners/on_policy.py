@@ -60,7 +60,7 @@ def trajectory_values(
         return network.apply(params, jax.vmap(task.observe)(state), method="value")
 
     def value_after(step: tuple) -> Array:
-        """Where no episode ended, the state after this step is the one before the next."""
+        """Where no episode ended, the state after this step is the one before the next; the last step has no next."""
         is_known, final_state, following = step
         return jax.lax.cond(is_known, lambda: following, lambda: value(final_state))
 
