@@ -12,9 +12,9 @@ import jaxswarm
 PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types"},
-    {"geometry", "sets", "distributions"},
-    {"dynamics", "aggregators"},
-    {"tasks.rendezvous", "networks"},
+    {"geometry", "contacts", "sets", "distributions"},
+    {"dynamics", "rigid2d", "aggregators"},
+    {"tasks.rendezvous", "tasks.boxes", "networks"},
     {"tasks"},
     {"rollout"},
     {"learners.on_policy"},
@@ -27,7 +27,7 @@ FLOORS = [
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
-WINGS = ({"geometry", "dynamics", "tasks"}, {"sets", "distributions", "aggregators", "networks"})
+WINGS = ({"geometry", "contacts", "dynamics", "rigid2d", "tasks"}, {"sets", "distributions", "aggregators", "networks"})
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")

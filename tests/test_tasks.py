@@ -111,9 +111,14 @@ def test_the_time_limit_truncates_at_exactly_the_episode_length(task):
 def test_one_agent_perceives_what_all_observe(task):
     state = reset(task, KEY)
     view, obs, perceive = jax.jit(task.view)(state), observe(task, state), jax.jit(task.perceive)
-    assert all(leaf.shape[0] == NUM_AGENTS for leaf in jax.tree.leaves(view))
     for agent in range(NUM_AGENTS):
         assert_close(perceive(view, jnp.array(agent)), jax.tree.map(lambda leaf, i=agent: leaf[i], obs))
+
+
+def test_views_grow_no_faster_than_the_number_of_agents(task):
+    few, many = (jax.eval_shape(lambda t: t.view(t.reset(KEY)), task.replace(num_agents=n)) for n in (5, 10))
+    for small, large in zip(jax.tree.leaves(few), jax.tree.leaves(many), strict=True):
+        assert large.size in (small.size, 2 * small.size)  # of other entities, or of agents
 
 
 def test_observations_are_functions_of_the_state(task):

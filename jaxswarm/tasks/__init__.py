@@ -1,5 +1,6 @@
 """The tasks, by name."""
 
+from jaxswarm.tasks.boxes import Assembly, Clustering
 from jaxswarm.tasks.rendezvous import Rendezvous
 
-TASKS = {"rendezvous": Rendezvous}
+TASKS = {"rendezvous": Rendezvous, "assembly": Assembly, "clustering": Clustering}
