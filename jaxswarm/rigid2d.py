@@ -45,6 +45,7 @@ from jaxswarm.contacts import (
 )
 from jaxswarm.types import pytree
 
+# Boxes that are pressed together overlap by up to 0.1 mm in the first, and by some millimetres in the second.
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5)}
 
 
@@ -194,20 +195,21 @@ def _solve(
     motions: Motions,
     impulses: dict[str, Array],
 ) -> tuple[Motions, dict[str, Array]]:
-    """Sweeps over all kinds of contact; those between discs, which form chains, come twice each time."""
-    order = ["disc_disc", *contacts]
+    """Sweeps over all kinds of contact, from those that give way least to those that give way most."""
 
     def sweep(index: Array | int, carry: tuple) -> tuple:
-        motions, impulses, slips = carry
-        for kind in order:
-            solve = partial(contacts[kind].solve, solver)
-            motions, impulse, slip = _apart(index, solve, motions, impulses[kind], slips[kind])
-            impulses, slips = impulses | {kind: impulse}, slips | {kind: slip}
-        return motions | {"disc": hold(motions["disc"])}, impulses, slips
+        motions, before = carry
+        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
+        impulses = {}
+        for kind, contact in contacts.items():
+            impulses[kind], change = _apart(index, partial(contact.answer, relaxation), motions, *before[kind])
+            motions = _apart(index, partial(contact.push, solver), motions, *change)
+        return motions | {"disc": hold(motions["disc"])}, impulses
 
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
-    motions, impulses, _ = jax.lax.fori_loop(0, solver.iterations, sweep, (motions, impulses, slips))
-    return motions, impulses
+    start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
+    motions, impulses = jax.lax.fori_loop(0, solver.iterations, sweep, (motions, start))
+    return motions, {kind: impulse for kind, (impulse, _) in impulses.items()}
 
 
 def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Motion:
