@@ -1,4 +1,4 @@
-"""Which discs and boxes touch in a walled square, and the impulses that keep them apart.
+"""The impulses that keep discs, boxes and walls apart, given where they touch.
 
 Contacts of one kind form `Rows`, dense arrays over all pairs: to compute all pairs of a few bodies is cheaper than to
 select those that touch. Worlds, any number of them, are the last axes: [..., *worlds].
@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxswarm.types import is_whole, pytree, require, static
@@ -29,9 +28,6 @@ BOX_INERTIA = BOX_MASS * BOX_SIDE**2 / 6
 
 TICK = 0.1  # s; drag acts, and motors reset the velocity of discs, once in this time
 DRAG = 0.92  # share of a velocity that is left after a tick, whatever moves
-
-_HALF = BOX_SIDE / 2
-_CORNERS = _HALF * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]], np.float32)
 
 
 class Offsets(NamedTuple):
@@ -95,7 +91,7 @@ class Motion:
 
     x: Float[Array, "bodies *worlds"]
     y: Float[Array, "bodies *worlds"]
-    turn: Float[Array, "bodies *worlds"] | None = None
+    turn: Any = None  # like x and y, or None
 
 
 Motions = dict[str, Motion]  # "disc", "box"
@@ -127,7 +123,7 @@ class Rows:
     own: str = static()
     other: str = static()
     is_mutual: bool = static(default=False)
-    mass: Float[Array, "points other own *worlds"] | None = None  # effective mass in contact, else 0; see `weighted`
+    mass: Any = None  # once `weighted`: effective mass in contact, else 0; like the others
 
     def weighted(self, solver: Solver) -> "Rows":
         """With masses 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)), n the number of contacts of a body."""
@@ -136,16 +132,16 @@ class Rows:
             linear, angular = _inverse_mass(kind, solver)
             return linear if arm is None else linear + angular * arm**2
 
-        total = _own(jnp.maximum(_sum(self.near, 1), 1)) * mobility(self.own, self.own_arm)
+        total = of_own(jnp.maximum(_sum(self.near, 1), 1)) * mobility(self.own, self.own_arm)
         if self.other != "wall":
-            total = total + _other(jnp.maximum(_sum(self.near, 2), 1)) * mobility(self.other, self.other_arm)
-        return self.replace(mass=self.near / total)
+            total = total + of_other(jnp.maximum(_sum(self.near, 2), 1)) * mobility(self.other, self.other_arm)
+        return dataclasses.replace(self, mass=self.near / total)
 
     def velocity(self, motions: Motions) -> Float[Array, "points other own *worlds"]:
         """At which pairs separate."""
-        result = _along(self.x, self.y, self.own_arm, _own(motions[self.own]))
+        result = _along(self.x, self.y, self.own_arm, of_own(motions[self.own]))
         if self.other != "wall":
-            result = result - _along(self.x, self.y, self.other_arm, _other(motions[self.other]))
+            result = result - _along(self.x, self.y, self.other_arm, of_other(motions[self.other]))
         return result
 
     def push(self, motions: Motions, impulse: Float[Array, "points other own *worlds"], solver: Solver) -> Motions:
@@ -158,12 +154,12 @@ class Rows:
         return motions | kicked
 
 
-def _own(bodies: Any) -> Any:
+def of_own(bodies: Any) -> Any:
     """Arrays [bodies, *worlds] as those of the own body of each pair."""
     return jax.tree.map(lambda v: v[None, None], bodies)
 
 
-def _other(bodies: Any) -> Any:
+def of_other(bodies: Any) -> Any:
     """Arrays [bodies, *worlds] as those of the other body of each pair."""
     return jax.tree.map(lambda v: v[None, :, None], bodies)
 
@@ -220,7 +216,7 @@ class Contact:
     def weighted(self, solver: Solver) -> "Contact":
         """With effective masses."""
         tangent = None if self.tangent is None else self.tangent.weighted(solver)
-        return self.replace(normal=self.normal.weighted(solver), tangent=tangent)
+        return dataclasses.replace(self, normal=self.normal.weighted(solver), tangent=tangent)
 
     def answer(
         self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
@@ -237,180 +233,9 @@ class Contact:
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None) -> Motions:
         """The motions after these impulses."""
         motions = self.normal.push(motions, impulse, solver)
-        return motions if self.tangent is None else self.tangent.push(motions, slip, solver)
-
-
-def _disc_disc(solver: Solver, disc: Pose) -> Contact:
-    index = np.arange(disc.x.shape[0])
-    order = _table(np.sign(index - index[:, None])[None], disc.x)
-    x = _own(disc.x) - _other(disc.x) + 1e-9 * order  # discs at one place part, too
-    y = _own(disc.y) - _other(disc.y)
-    squared = jnp.maximum(x**2 + y**2, 1e-18)
-    inverse = jax.lax.rsqrt(squared)
-    gap = squared * inverse - (2 * DISC_RADIUS + solver.offsets.disc_disc)
-    near = (gap < solver.margin) * jnp.abs(order)
-    rows = Rows(x * inverse, y * inverse, None, None, near, own="disc", other="disc")
-    return Contact(rows, gap, _bias(solver, gap, solver.recovery))
-
-
-def _table(values: np.ndarray, like: Array) -> Array:
-    """Numbers for each pair of bodies in all worlds, those of `like`, [bodies, *worlds]."""
-    return jnp.asarray(values.reshape(*values.shape, *[1] * (like.ndim - 1)), jnp.float32)
-
-
-def _bias(solver: Solver, gap: Array, recovery: float) -> Array:
-    return jnp.where(gap > 0, gap, recovery * gap) * (1 / solver.duration)
-
-
-def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
-    """Discs touch the nearest point of a box; one whose centre is inside leaves by the nearest face."""
-    box = _other(box)
-    dx, dy = _own(disc.x) - box.x, _own(disc.y) - box.y
-    x, y = box.cos * dx + box.sin * dy, box.cos * dy - box.sin * dx
-    out_x, out_y = jnp.abs(x) - _HALF, jnp.abs(y) - _HALF
-    edge_x, edge_y = jnp.maximum(out_x, 0), jnp.maximum(out_y, 0)
-    squared = jnp.maximum(edge_x**2 + edge_y**2, 1e-14)
-    is_outside, by_x = squared > 1e-14, out_x > out_y
-    inverse = jax.lax.rsqrt(squared)
-    local_x = jnp.where(is_outside, edge_x * inverse, by_x) * jnp.where(x >= 0, 1, -1)
-    local_y = jnp.where(is_outside, edge_y * inverse, ~by_x) * jnp.where(y >= 0, 1, -1)
-    gap = jnp.where(is_outside, squared * inverse, jnp.maximum(out_x, out_y))
-    gap = gap - (DISC_RADIUS + solver.offsets.disc_box)
-    arm = jnp.clip(x, -_HALF, _HALF) * local_y - jnp.clip(y, -_HALF, _HALF) * local_x
-    near = (gap < solver.margin) * _other(present)
-    normal = box.cos * local_x - box.sin * local_y, box.sin * local_x + box.cos * local_y
-    rows = Rows(*normal, None, arm, near, own="disc", other="box", is_mutual=True)
-    return Contact(rows, gap, _bias(solver, gap, solver.recovery))
-
-
-def _box_box(solver: Solver, box: Pose, present: Array) -> Contact:
-    """Two points for each pair: the facing edge of one box, clipped to the width of the face of the other.
-
-    The separating axis is that of the box, then called the reference, from whose face the other is farther. In its
-    axes, u along the normal of that face and t along the face, the other box is at (u, t), turned by an angle that
-    equal squares allow to reduce to a turn of at most 45 degrees either way.
-    """
-    index = np.arange(box.x.shape[0])
-    is_first = _table(index[None] < index[:, None], box.x)[None] > 0
-    own, other = _own(box), _other(box)
-    dx, dy = other.x - own.x, other.y - own.y
-
-    def separation(pose: Pose) -> Array:
-        return jnp.maximum(jnp.abs(pose.cos * dx + pose.sin * dy), jnp.abs(pose.cos * dy - pose.sin * dx))
-
-    own_separation, other_separation = separation(own), separation(other)
-    is_own = (own_separation > other_separation) | ((own_separation == other_separation) & is_first)
-    sign = jnp.where(is_own, 1.0, -1.0)
-    face_x, face_y, u, t, turn_cos, turn_sin = _facing(own, other, dx, dy, is_own)
-    edge_u, edge_t = u - _HALF * turn_cos, t - _HALF * turn_sin
-    end = _table(np.array([-_HALF, _HALF])[:, None, None], box.x)
-    point_t = jnp.clip(edge_t + end * turn_cos, -_HALF, _HALF)
-    point_u = edge_u - (point_t - edge_t) * (turn_sin / turn_cos)
-    gap = point_u - _HALF - solver.offsets.box_box
-    is_pair = _table(1 - np.eye(len(index))[None], box.x) * _own(present) * _other(present)
-    near = (gap < solver.margin) * is_pair
-    own_t, other_t = (sign * jnp.where(x, point_t, point_t - t) for x in (is_own, ~is_own))
-    normal = Rows(-sign * face_x, -sign * face_y, own_t, other_t, near, own="box", other="box")
-
-    middle = _mean((point_u + _HALF) / 2, near)
-    own_u, other_u = (sign * jnp.where(x, middle, middle - u) for x in (is_own, ~is_own))
-    touching = near.max(0, keepdims=True)
-    tangent = Rows(sign * face_y, -sign * face_x, -own_u, -other_u, touching, own="box", other="box")
-    return Contact(normal, gap, _bias(solver, gap, 0.0), tangent, solver.box_friction)
-
-
-def _mean(values: Array, near: Array) -> Array:
-    """Over the points of each pair that are in contact, with one point left."""
-    return (values * near).sum(0, keepdims=True) / jnp.maximum(near.sum(0, keepdims=True), 1)
-
-
-def _facing(own: Pose, other: Pose, dx: Array, dy: Array, is_own: Array) -> tuple[Array, ...]:
-    """The normal of the reference's face, in world axes; in its own, where the other box is: u, t, cos, sin."""
-    sign = jnp.where(is_own, 1.0, -1.0)
-    cos, sin = jnp.where(is_own, own.cos, other.cos), jnp.where(is_own, own.sin, other.sin)
-    x, y = sign * (cos * dx + sin * dy), sign * (cos * dy - sin * dx)
-    by_x = jnp.abs(x) >= jnp.abs(y)
-    side = jnp.where(jnp.where(by_x, x, y) >= 0, 1.0, -1.0)
-    normal_x, normal_y = jnp.where(by_x, side, 0), jnp.where(by_x, 0, side)
-    u, t = jnp.where(by_x, jnp.abs(x), jnp.abs(y)), y * normal_x - x * normal_y
-    turn_cos = own.cos * other.cos + own.sin * other.sin
-    turn_sin = sign * (own.cos * other.sin - own.sin * other.cos)
-    is_small = jnp.abs(turn_cos) >= jnp.abs(turn_sin)
-    reduced_cos = jnp.where(is_small, jnp.abs(turn_cos), jnp.abs(turn_sin))
-    reduced_sin = jnp.where(is_small, turn_sin * jnp.sign(turn_cos), -turn_cos * jnp.sign(turn_sin))
-    return cos * normal_x - sin * normal_y, sin * normal_x + cos * normal_y, u, t, reduced_cos, reduced_sin
-
-
-def _box_wall(solver: Solver, box: Pose, present: Array, side: Array) -> Contact:
-    """The two foremost corners of boxes against the nearer of the walls x = +-side/2, and of y = +-side/2."""
-    is_x = _table(np.array([True, False])[None, :, None], box.x) > 0
-    flip = _table(np.array([1, -1])[:, None, None], box.x)
-    box = _own(box)
-    place = jnp.where(is_x, box.x, box.y)
-    outward = jnp.where(place < 0, -1.0, 1.0)
-    along_x, along_y = jnp.where(is_x, box.cos, box.sin), jnp.where(is_x, -box.sin, box.cos)  # the wall's normal
-    corner_x, corner_y = _HALF * _sign(outward * along_x), _HALF * _sign(outward * along_y)
-    is_front_x = jnp.abs(along_x) >= jnp.abs(along_y)  # the face in front is the box's x face; the corners differ in y
-    corner_x, corner_y = (
-        jnp.where(is_front_x, corner_x, flip * corner_x),
-        jnp.where(is_front_x, flip * corner_y, corner_y),
-    )
-    arm_x, arm_y = box.cos * corner_x - box.sin * corner_y, box.sin * corner_x + box.cos * corner_y
-    gap = side / 2 - solver.offsets.box_wall - outward * (place + jnp.where(is_x, arm_x, arm_y))
-    near = (gap < solver.margin) * _own(present)
-    zero = jnp.zeros_like(gap)
-    inward_x, inward_y = jnp.where(is_x, -outward, zero), jnp.where(is_x, zero, -outward)
-    normal_arm = jnp.where(is_x, arm_y, -arm_x) * outward
-    normal = Rows(inward_x, inward_y, normal_arm, None, near, own="box", other="wall")
-    tangent_arm = _mean(jnp.where(is_x, arm_x, -arm_y), near)
-    tangent_x, tangent_y = jnp.where(is_x, zero[:1], 1.0), jnp.where(is_x, 1.0, zero[:1])
-    touching = near.max(0, keepdims=True)
-    tangent = Rows(tangent_x, tangent_y, tangent_arm, None, touching, own="box", other="wall")
-    return Contact(normal, gap, _bias(solver, gap, 0.0), tangent, solver.wall_friction)
-
-
-def _sign(x: Array) -> Array:
-    return jnp.where(x < 0, -1.0, 1.0)
-
-
-def find_contacts(
-    solver: Solver,
-    side: Float[Array, "*worlds"],
-    disc: Pose,
-    box: Pose,
-    present: Float[Array, "boxes *worlds"],
-) -> dict[str, Contact]:
-    """All pairs that might touch, by kind, in the order in which they are solved."""
-    return {
-        "box_wall": _box_wall(solver, box, present, side[None, None, None]),
-        "box_box": _box_box(solver, box, present),
-        "disc_box": _disc_box(solver, disc, box, present),
-        "disc_disc": _disc_disc(solver, disc),
-    }
-
-
-def no_impulses(disc: Float[Array, "discs *worlds"], box: Float[Array, "boxes *worlds"]) -> dict[str, Array]:
-    """Zeros for all contacts; made of coordinates of bodies, so that worlds may be spread over devices."""
-    walls, points = np.zeros((1, 2, 1)), np.zeros((2, 1, 1))
-    return {
-        "disc_disc": 0 * (_own(disc) + _other(disc)),
-        "disc_box": 0 * (_own(disc) + _other(box)),
-        "box_box": 0 * (_own(box) + _other(box)) + _table(points, box),
-        "box_wall": 0 * _own(box) + _table(points + walls, box),
-    }
+        return motions if self.tangent is None or slip is None else self.tangent.push(motions, slip, solver)
 
 
 def weigh_contacts(solver: Solver, contacts: dict[str, Contact]) -> dict[str, Contact]:
     """The same, with effective masses."""
     return {kind: contact.weighted(solver) for kind, contact in contacts.items()}
-
-
-def hold_discs(solver: Solver, side: Float[Array, "*worlds"], disc: Pose, motion: Motion) -> Motion:
-    """The velocity of discs that walls leave them."""
-
-    def held(place: Array, velocity: Array) -> Array:
-        gap = side[None] / 2 - (DISC_RADIUS + solver.offsets.disc_wall) - jnp.abs(place)
-        bias = _bias(solver, gap, solver.recovery)
-        return velocity - jnp.sign(place) * jnp.maximum(jnp.sign(place) * velocity - bias, 0)
-
-    return Motion(held(disc.x, motion.x), held(disc.y, motion.y))

@@ -21,32 +21,24 @@ States of any world are moved that have these fields, in metres, radians and sec
 Write `Solver(...)` for other settings than those of `PRESETS`.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxswarm.contacts import (
-    DRAG,
-    TICK,
-    Contact,
-    Motion,
-    Motions,
-    Pose,
-    Solver,
-    find_contacts,
-    hold_discs,
-    no_impulses,
-    weigh_contacts,
-)
+from jaxswarm.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver, weigh_contacts
+from jaxswarm.shapes import find_contacts, hold_discs, no_impulses
 from jaxswarm.types import pytree
 
 # Boxes that are pressed together overlap by up to 0.1 mm in the first, and by some millimetres in the second.
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5)}
+
+BLOCK = 64  # worlds; measured, see benchmarks/LOG.md
 
 
 def move(solver: Solver, side: Float[Array, ""] | float, state: Any, command: Float[Array, "agents 2"]) -> Any:
@@ -55,7 +47,7 @@ def move(solver: Solver, side: Float[Array, ""] | float, state: Any, command: Fl
     Free discs reach 0.92 of both. A disc that is held up does not turn any slower. k discs that push a box squarely
     drive it at 0.92 k m v / (k m + 0.08 M). Headings of discs end in [-pi, pi], where float32 is finest.
     """
-    return _replace(state, partial(_simulate, solver, solver.substeps, True), side, command)
+    return _simulate(_Program(solver, solver.substeps, has_inertia=True), side, state, command)
 
 
 def settle(solver: Solver, side: Float[Array, ""] | float, state: Any, substeps: int = 40) -> Any:
@@ -63,38 +55,66 @@ def settle(solver: Solver, side: Float[Array, ""] | float, state: Any, substeps:
 
     Forty substeps part any random placement of a few bodies, to within 0.1 mm.
     """
-    state = _replace(state, partial(_simulate, solver, substeps, False), side, jnp.zeros_like(state.position))
+    program = _Program(solver, substeps, has_inertia=False)
+    state = _simulate(program, side, state, jnp.zeros_like(state.position))
     return state.replace(box_velocity=jnp.zeros_like(state.box_velocity))
 
 
-def _replace(state: Any, simulate: Callable, side: Array | float, command: Array) -> Any:
+class _Program(NamedTuple):
+    """What is compiled; boxes without inertia stop after each substep."""
+
+    solver: Solver
+    num_substeps: int
+    has_inertia: bool
+
+
+def _simulate(program: _Program, side: Array | float, state: Any, command: Array) -> Any:
     names = ("position", "heading", "box_position", "box_heading", "box_velocity")
-    present = state.box_present.astype(jnp.float32)
-    bodies = [getattr(state, name) for name in names]
-    moved = _worlds_last(simulate)(jnp.asarray(side, jnp.float32), command, present, *bodies)
+    arrays = [jnp.asarray(side, jnp.float32), command, state.box_present.astype(jnp.float32)]
+    moved = _worlds_last(program)(*arrays, *(getattr(state, name) for name in names))
     return state.replace(**dict(zip(names, moved, strict=True)))
 
 
-def _worlds_last(function: Callable) -> Callable:
-    """Under `vmap`, calls a function once with all worlds in the last axis, rather than mapping what it does.
+def _worlds_last(program: _Program) -> Callable:
+    """`_run` that under `vmap` is called once, with all worlds in the last axis, rather than mapped inside.
 
-    Its few bodies then lie side by side with those of all other worlds, which made the solver three times as fast on
-    CPU. The function takes and gives tuples of arrays, and must accept a last axis that its description does not have.
-    Derivatives take the function as it is: JAX cannot transpose one that has its own batching rule.
+    A world's few bodies then lie side by side with those of all others, which made the solver three times as fast on
+    CPU. Derivatives take `_run` as it is, because JAX cannot transpose what has a batching rule of its own.
     """
-    batched = jax.custom_batching.custom_vmap(function)
+    plain = partial(_run, program, False)
+    batched = jax.custom_batching.custom_vmap(
+        lambda *arrays: jax.lax.platform_dependent(*arrays, cpu=partial(_run, program, True), default=plain)
+    )
 
     @batched.def_vmap
     def many(num_worlds: int, is_batched: list, *arrays: Array) -> tuple:
         def last(x: Array, has_worlds: bool) -> Array:
             return jnp.moveaxis(x, 0, -1) if has_worlds else jnp.broadcast_to(x[..., None], (*x.shape, num_worlds))
 
-        result = function(*map(last, arrays, is_batched))
+        arrays = tuple(map(last, arrays, is_batched))
+        result = jax.lax.platform_dependent(*arrays, cpu=partial(_run_blocks, program), default=plain)
         return tuple(jnp.moveaxis(x, -1, 0) for x in result), (True,) * len(result)
 
     differentiable = jax.custom_jvp(batched)
-    differentiable.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+    differentiable.defjvp(lambda primals, tangents: jax.jvp(plain, primals, tangents))
     return differentiable
+
+
+def _run_blocks(program: _Program, *arrays: Array) -> tuple[Array, ...]:
+    """`_run` for `BLOCK` worlds at a time, which the cache of a CPU can hold."""
+    run = partial(_run, program, True)
+    num_worlds = arrays[0].shape[-1]
+    if num_worlds <= BLOCK:
+        return run(*arrays)
+    fill = -num_worlds % BLOCK
+
+    def split(x: Array) -> Array:
+        x = jnp.concatenate([x, x[..., :fill]], -1)
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, BLOCK), -2, 0)
+
+    result = jax.lax.map(lambda block: run(*block), jax.tree.map(split, arrays))
+    joined = (jnp.moveaxis(x, 0, -2) for x in result)
+    return tuple(x.reshape(*x.shape[:-2], -1)[..., :num_worlds] for x in joined)
 
 
 # What follows takes any number of worlds as last axes: [..., *worlds].
@@ -110,10 +130,9 @@ class _Bodies:
     impulses: dict[str, Array]  # of each kind of contact
 
 
-def _simulate(
-    solver: Solver,
-    num_substeps: int,
-    has_inertia: bool,
+def _run(
+    program: _Program,
+    is_apart: bool,
     side: Float[Array, "*worlds"],
     command: Float[Array, "discs 2 *worlds"],
     present: Float[Array, "boxes *worlds"],
@@ -123,7 +142,9 @@ def _simulate(
     box_heading: Float[Array, "boxes *worlds"],
     box_velocity: Float[Array, "boxes 3 *worlds"],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """The last five arguments after so many substeps; boxes without inertia stop after each."""
+    """The last five arguments at the end; if stages are to be compiled apart, see `_apart`."""
+    solver, num_substeps, has_inertia = program
+    stage = _apart if is_apart else _together
     speed, rate = DRAG * command[:, 0], DRAG * command[:, 1]
     turn = solver.duration * rate
     aim = heading + (turn - TICK * rate) / 2  # the mean heading of the ticks in a substep
@@ -131,9 +152,10 @@ def _simulate(
 
     def substep(index: Array | int, bodies: _Bodies) -> _Bodies:
         cos, sin = bodies.disc.cos, bodies.disc.sin
-        bodies = _substep(solver, has_inertia, side, present, Motion(speed * cos, speed * sin), bodies, index)
-        turned = bodies.disc.replace(cos=cos * turn_cos - sin * turn_sin, sin=sin * turn_cos + cos * turn_sin)
-        return bodies.replace(disc=turned)
+        drive = Motion(speed * cos, speed * sin)
+        bodies = _substep(solver, partial(stage, index), has_inertia, side, present, drive, bodies)
+        turned = {"cos": cos * turn_cos - sin * turn_sin, "sin": sin * turn_cos + cos * turn_sin}
+        return dataclasses.replace(bodies, disc=dataclasses.replace(bodies.disc, **turned))
 
     disc = Pose(position[:, 0], position[:, 1], jnp.cos(aim), jnp.sin(aim))
     box = Motion(box_position[:, 0], box_position[:, 1], box_heading)
@@ -157,25 +179,25 @@ def _wrap(angle: Array) -> Array:
 
 
 def _substep(
-    solver: Solver, has_inertia: bool, side: Array, present: Array, drive: Motion, bodies: _Bodies, index: Array | int
+    solver: Solver, stage: Callable, has_inertia: bool, side: Array, present: Array, drive: Motion, bodies: _Bodies
 ) -> _Bodies:
     """Contacts where bodies are; velocities that keep them apart; then everything moves."""
     box = Pose(bodies.box.x, bodies.box.y, jnp.cos(bodies.box.turn), jnp.sin(bodies.box.turn))
-    contacts = _apart(index, partial(find_contacts, solver), side, bodies.disc, box, present)
-    contacts = _apart(index, partial(weigh_contacts, solver), contacts)
+    contacts = stage(partial(find_contacts, solver), side, bodies.disc, box, present)
+    contacts = stage(partial(weigh_contacts, solver), contacts)
     inertia = solver.drag * present if has_inertia else 0 * present
     motions = {"disc": drive, "box": jax.tree.map(lambda v: inertia * v, bodies.velocity)}
-    motions, impulses = _apart(index, partial(_warm_start, solver), contacts, motions, bodies.impulses)
+    motions, impulses = stage(partial(_warm_start, solver), contacts, motions, bodies.impulses)
     hold = partial(hold_discs, solver, side, bodies.disc)
-    motions, impulses = _solve(solver, contacts, hold, motions, impulses)
-    shift = _apart(index, partial(_part_boxes, solver), contacts, bodies.box)
+    motions, impulses = _solve(solver, stage, contacts, hold, motions, impulses)
+    shift = stage(partial(_part_boxes, solver), contacts, bodies.box)
 
     def advance(place: Array, velocity: Array) -> Array:
         return place + solver.duration * velocity
 
-    disc = bodies.disc.replace(x=advance(bodies.disc.x, motions["disc"].x), y=advance(bodies.disc.y, motions["disc"].y))
+    x, y = advance(bodies.disc.x, motions["disc"].x), advance(bodies.disc.y, motions["disc"].y)
     moved = jax.tree.map(lambda a, v, s: advance(a, v) + s, bodies.box, motions["box"], shift)
-    return _Bodies(disc, moved, motions["box"], impulses)
+    return _Bodies(dataclasses.replace(bodies.disc, x=x, y=y), moved, motions["box"], impulses)
 
 
 def _warm_start(
@@ -190,6 +212,7 @@ def _warm_start(
 
 def _solve(
     solver: Solver,
+    stage: Callable,
     contacts: dict[str, Contact],
     hold: Callable[[Motion], Motion],
     motions: Motions,
@@ -202,8 +225,8 @@ def _solve(
         relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
         impulses = {}
         for kind, contact in contacts.items():
-            impulses[kind], change = _apart(index, partial(contact.answer, relaxation), motions, *before[kind])
-            motions = _apart(index, partial(contact.push, solver), motions, *change)
+            impulses[kind], change = stage(partial(contact.answer, relaxation), motions, *before[kind])
+            motions = stage(partial(contact.push, solver), motions, *change)
         return motions | {"disc": hold(motions["disc"])}, impulses
 
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
@@ -222,17 +245,15 @@ def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Mo
     return shift["box"]
 
 
+def _together(_: Array | int, function: Callable, *args: Any) -> Any:
+    return function(*args)
+
+
 def _apart(index: Array | int, function: Callable, *args: Any) -> Any:
     """`function(*args)`, compiled by itself; `index` is that of a loop.
 
     XLA on a CPU fuses all it can, and then computes what functions share again for each of their results, which took
     five times as long. A conditional that it cannot foresee keeps it from that. On a GPU conditionals are dear.
     """
-    if isinstance(index, int):  # nothing is compiled
-        return function(*args)
-
-    def alone(*args: Any) -> Any:
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, *args))
-        return jax.lax.cond(index >= 0, function, lambda *_: nothing, *args)
-
-    return jax.lax.platform_dependent(*args, cpu=alone, default=function)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, *args))
+    return jax.lax.cond(index >= 0, function, lambda *_: nothing, *args)

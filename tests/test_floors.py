@@ -13,7 +13,8 @@ PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types"},
     {"geometry", "contacts", "sets", "distributions"},
-    {"dynamics", "rigid2d", "aggregators"},
+    {"dynamics", "shapes", "aggregators"},
+    {"rigid2d"},
     {"tasks.rendezvous", "tasks.boxes", "networks"},
     {"tasks"},
     {"rollout"},
@@ -27,7 +28,10 @@ FLOORS = [
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
-WINGS = ({"geometry", "contacts", "dynamics", "rigid2d", "tasks"}, {"sets", "distributions", "aggregators", "networks"})
+WINGS = (
+    {"geometry", "contacts", "dynamics", "shapes", "rigid2d", "tasks"},
+    {"sets", "distributions", "aggregators", "networks"},
+)
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")

@@ -144,9 +144,13 @@ def test_discs_end_where_box2d_leaves_them(name):
 def test_ten_discs_and_four_boxes_move_as_in_box2d():
     record = GOLDEN["random"]
     start = bodies(record["discs"], record["boxes"], np.zeros((4, 3)), np.ones(4, bool))
-    states = replay(FAITHFUL, jnp.float32(record["world"]), start, jnp.array(record["cmd_per_env_step"]))
+    parts = []
+    for part in np.split(np.array(record["cmd_per_env_step"], np.float32), 3):
+        parts.append(replay(FAITHFUL, jnp.float32(record["world"]), start, jnp.array(part)))
+        start = at(parts[-1], -1)
+    positions = np.concatenate([part.box_position for part in parts])
     expected = np.array(record["every5env_boxes"])
-    deviation = np.abs(states.box_position[4::5] - expected[1:, :, :2]).max((1, 2))
+    deviation = np.abs(positions[4::5] - expected[1:, :, :2]).max((1, 2))
     assert np.abs(expected[-1] - expected[0]).max() > 0.02  # boxes are moved
     assert deviation[1] < 1e-3  # after 10 s
     assert deviation[-1] < 3e-3
@@ -171,16 +175,16 @@ def test_bodies_inside_the_offsets_part_and_rest():
 
 
 def crowd():
-    """A full, narrow world without overlaps, and commands that keep its bodies pushing each other."""
-    keys = jax.random.split(KEY, 5)
-    discs = np.concatenate([jax.random.uniform(keys[0], (10, 2), minval=-0.2, maxval=0.2), np.zeros((10, 1))], 1)
-    discs[:, 2] = jax.random.uniform(keys[1], (10,), maxval=6.0)
-    boxes = [[-0.1, -0.1, 0.2], [0.1, -0.1, 0.5], [-0.1, 0.1, -0.3], [0.1, 0.1, 1.0]]
-    start = jax.jit(rigid2d.settle, static_argnums=0)(
-        FAITHFUL, jnp.float32(0.5), bodies(discs, boxes, np.zeros((4, 3)), np.ones(4, bool))
-    )
-    speed = jax.random.uniform(keys[2], (STEPS, 10), minval=0.5, maxval=1.0) * MAX_SPEED
-    return start, jnp.stack([speed, jax.random.uniform(keys[3], (STEPS, 10), minval=-0.3, maxval=0.3)], -1)
+    """Ten discs around four boxes in a narrow world, and commands that drive them together."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * 0.2
+    along = np.linspace(0.05, 3.95, 10)
+    discs = np.stack([np.interp(along, range(5), corners[:, axis]) for axis in (0, 1)], -1)
+    discs = np.concatenate([discs, np.arctan2(-discs[:, 1:], -discs[:, :1])], 1)
+    boxes = [[-0.08, -0.08, 0.2], [0.08, -0.08, 0.5], [-0.08, 0.08, -0.3], [0.08, 0.08, 1.0]]
+    speed_key, turn_key = jax.random.split(KEY)
+    speed = jax.random.uniform(speed_key, (STEPS, 10), minval=0.5, maxval=1.0) * MAX_SPEED
+    command = jnp.stack([speed, jax.random.uniform(turn_key, (STEPS, 10), minval=-0.1, maxval=0.1)], -1)
+    return bodies(discs, boxes, np.zeros((4, 3)), np.ones(4, bool)), command
 
 
 def permuted(state, command):
@@ -253,6 +257,18 @@ def test_one_world_moves_as_among_many():
     alone, among = replay(FAITHFUL, jnp.float32(0.5), start, command), at(crowd_and_images(), 0)
     np.testing.assert_allclose(alone.position, among.position, atol=1e-5)
     np.testing.assert_allclose(alone.box_position, among.box_position, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_more_worlds_than_a_block_move_as_few():
+    start, command = crowd()
+    num_worlds = rigid2d.BLOCK + 3
+    states, commands_of_all = (jax.tree.map(lambda x: jnp.stack([x] * num_worlds), x) for x in (start, command))
+    among = replay_worlds(FAITHFUL, jnp.float32(0.5), states, commands_of_all)
+    alone = replay(FAITHFUL, jnp.float32(0.5), start, command)
+    for name in ("position", "box_position", "box_heading"):
+        expected = np.broadcast_to(getattr(alone, name), getattr(among, name).shape)
+        np.testing.assert_allclose(getattr(among, name), expected, atol=1e-5)
 
 
 def test_absent_boxes_touch_nothing_and_stay():

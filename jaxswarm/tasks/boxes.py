@@ -4,6 +4,7 @@ One world with different rewards. A robot is a disc, and a box a square, of `rig
 at the origin, with x and y in [-side/2, side/2].
 """
 
+import dataclasses
 import math
 from typing import ClassVar
 
@@ -65,20 +66,19 @@ class Arena:
 
     def reset(self, key: Key) -> State:
         """Robots anywhere, boxes in the middle, looking anywhere; overlaps are then mostly pushed apart."""
-        names = ("position", "heading", "box_position", "box_heading", "number")
-        keys = dict(zip(names, jax.random.split(key, 5), strict=True))
+        position_key, heading_key, box_position_key, box_heading_key, number_key = jax.random.split(key, 5)
 
-        def uniform(name: str, bound: float | Array, *shape: int) -> Array:
-            return bound * jax.random.uniform(keys[name], shape, minval=-1.0)
+        def uniform(key: Key, bound: float | Array, *shape: int) -> Array:
+            return bound * jax.random.uniform(key, shape, minval=-1.0)
 
-        position = uniform("position", self.side / 2, self.num_agents, 2)
+        position = uniform(position_key, self.side / 2, self.num_agents, 2)
         limit = self.side / 2 - MARGIN
-        number = jax.random.randint(keys["number"], (), self.min_boxes, self.num_boxes + 1)
+        number = jax.random.randint(number_key, (), self.min_boxes, self.num_boxes + 1)
         state = State(
             position=jnp.clip(position, -limit, limit),
-            heading=uniform("heading", math.pi, self.num_agents),
-            box_position=uniform("box_position", CENTRAL * self.side / 2, self.num_boxes, 2),
-            box_heading=uniform("box_heading", math.pi, self.num_boxes),
+            heading=uniform(heading_key, math.pi, self.num_agents),
+            box_position=uniform(box_position_key, CENTRAL * self.side / 2, self.num_boxes, 2),
+            box_heading=uniform(box_heading_key, math.pi, self.num_boxes),
             box_velocity=jnp.zeros((self.num_boxes, 3)),
             box_present=jnp.asarray(self.turn_taking()) < number,
             time=jnp.zeros((), jnp.int32),
@@ -97,7 +97,7 @@ class Arena:
         speed, turn_rate = MAX_SPEED / 2 * (action[:, 0] + 1), MAX_TURN_RATE * action[:, 1]
         command = jnp.stack([speed, turn_rate], -1)
         state = rigid2d.move(rigid2d.PRESETS[self.physics], self.side, state, command)
-        return state.replace(time=state.time + 1)
+        return dataclasses.replace(state, time=state.time + 1)
 
     def view(self, state: State) -> View:
         """What `perceive` needs of a state."""
@@ -300,14 +300,14 @@ class Clustering:
         boxes = obs.groups["boxes"]
         if self.cluster_identity == "one-hot":
             identity = jax.nn.one_hot(jnp.array(self.cluster), self.num_clusters)
-            features = jnp.concatenate([boxes.features, identity], -1)
-            return obs.replace(groups=obs.groups | {"boxes": boxes.replace(features=features)})
+            boxes = Entities(jnp.concatenate([boxes.features, identity], -1), boxes.mask)
+            return Observation(obs.own, obs.groups | {"boxes": boxes})
         sizes = np.bincount(self.cluster)
         parts = [slice(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
         groups = {
             f"boxes_{index}": Entities(boxes.features[part], boxes.mask[part]) for index, part in enumerate(parts)
         }
-        return obs.replace(groups={"neighbors": obs.groups["neighbors"]} | groups)
+        return Observation(obs.own, {"neighbors": obs.groups["neighbors"]} | groups)
 
     def observe(self, state: State) -> Observation:
         """What each robot perceives."""

@@ -1,0 +1,171 @@
+"""How many environment steps a second the box worlds take, beside Box2D from Python on the same scenes.
+
+    python benchmarks/box_physics.py [worlds=1,64,1024] [seconds=2] [physics=faithful]
+
+prints one JSON object per line, in seconds of CPU of this one process, so that other processes matter little. `physics`
+rows take steps of 1 s with the same random commands, `environment` rows also make observations and the reward. Box2D
+has one world at a time: its Python sets the velocities of all robots before each of ten steps of 0.1 s, as the program
+of the thesis did, and its environment uses NumPy for observations and reward. Needs the extra `benchmarks`.
+"""
+
+import importlib.metadata
+import itertools
+import json
+import math
+import os
+import platform
+import sys
+import time
+
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+if hasattr(os, "sched_setaffinity"):  # one core
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+import jax
+import numpy as np
+from Box2D import b2ChainShape, b2CircleShape, b2FixtureDef, b2PolygonShape, b2World
+
+from jaxswarm.contacts import MAX_SPEED, MAX_TURN_RATE
+from jaxswarm.tasks.boxes import Assembly
+
+SCENES = ((10, 4, 1.0), (20, 12, 2.0))
+UNITS = 25  # of Box2D per metre
+HOLD = 5  # steps for which robots keep their commands
+
+
+class Box2DWorld:
+    """The original world; poses are rows of x, y, heading."""
+
+    def __init__(self, side: float, robots: np.ndarray, boxes: np.ndarray):
+        self.world = b2World(gravity=(0, 0), doSleep=True)
+        half = side * UNITS / 2
+        walls = b2ChainShape(vertices_loop=[(-half, -half), (half, -half), (half, half), (-half, half)])
+        self.world.CreateStaticBody(fixtures=b2FixtureDef(shape=walls, friction=0.2))
+        square, disc = b2PolygonShape(box=(0.05 * UNITS, 0.05 * UNITS)), b2CircleShape(radius=0.0165 * UNITS)
+        self.boxes = [self._body(pose, square, 0.01) for pose in boxes]
+        self.robots = [self._body(pose, disc, 0.0) for pose in robots]
+
+    def _body(self, pose, shape, friction):
+        x, y, angle = map(float, pose)
+        fixture = b2FixtureDef(shape=shape, density=2, friction=friction, restitution=0)
+        place = (x * UNITS, y * UNITS)
+        return self.world.CreateDynamicBody(
+            position=place, angle=angle, linearDamping=0.8, angularDamping=0.8, fixtures=fixture
+        )
+
+    def step(self, commands: list) -> None:
+        for _ in range(10):
+            for robot, (speed, turn_rate) in zip(self.robots, commands, strict=True):
+                angle = robot.angle
+                robot.linearVelocity = (UNITS * speed * math.cos(angle), UNITS * speed * math.sin(angle))
+                robot.angularVelocity = turn_rate
+            self.world.Step(0.1, 10, 10)
+            self.world.ClearForces()
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        return tuple(
+            np.array([(*body.position, body.angle) for body in bodies]) / (UNITS, UNITS, 1)
+            for bodies in (self.robots, self.boxes)
+        )
+
+
+def numpy_observation(robots: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Of all robots, flat, as the original lays it out."""
+
+    def seen(others: np.ndarray) -> list[np.ndarray]:
+        delta = others[None, :, :2] - robots[:, None, :2]
+        bearing = np.arctan2(delta[..., 1], delta[..., 0]) - robots[:, None, 2]
+        turn = others[None, :, 2] - robots[:, None, 2]
+        return [np.linalg.norm(delta, axis=-1), np.sin(bearing), np.cos(bearing), np.sin(turn), np.cos(turn)]
+
+    count = len(robots)
+    neighbors = np.stack(seen(robots), -1)[~np.eye(count, dtype=bool)].reshape(count, -1)
+    places = [np.broadcast_to(boxes[:, i], (count, len(boxes))) for i in (0, 1)]
+    own = np.stack([robots[:, 0], robots[:, 1], np.sin(robots[:, 2]), np.cos(robots[:, 2]), np.ones(count)], -1)
+    return np.concatenate([neighbors, np.stack([*seen(boxes), *places], -1).reshape(count, -1), own], -1)
+
+
+def box_distances(boxes: np.ndarray) -> float:
+    return sum(math.dist(a[:2], b[:2]) for a, b in itertools.combinations(boxes, 2))
+
+
+def box2d_rate(task: Assembly, is_environment: bool, seconds: float) -> float:
+    """Environment steps per second of CPU."""
+    generator = np.random.default_rng(0)
+    state = task.reset(jax.random.key(0))
+    robots = np.concatenate([state.position, state.heading[:, None]], -1)
+    boxes = np.concatenate([state.box_position, state.box_heading[:, None]], -1)
+    world, before, steps = Box2DWorld(task.side, robots, boxes), box_distances(boxes), 0
+    start = time.process_time()
+    while time.process_time() - start < seconds:
+        speed = MAX_SPEED * generator.random(task.num_agents)
+        turn_rate = MAX_TURN_RATE * generator.uniform(-1, 1, task.num_agents)
+        commands = list(zip(speed.tolist(), turn_rate.tolist(), strict=True))
+        for _ in range(HOLD):
+            world.step(commands)
+            if is_environment:
+                poses = world.poses()
+                numpy_observation(*poses)
+                before, _ = (after := box_distances(poses[1])), before - after
+            steps += 1
+    return steps / (time.process_time() - start)
+
+
+def jaxswarm_rate(task: Assembly, num_worlds: int, is_environment: bool, seconds: float) -> tuple[float, float]:
+    """Environment steps per second of CPU, and seconds to trace and compile."""
+
+    @jax.jit
+    def advance(states, key):
+        action = jax.random.uniform(key, (num_worlds, task.num_agents, 2), minval=-1)
+
+        def step(states, _):
+            if not is_environment:
+                return jax.vmap(task.arena.move)(states, action), None
+            states, outcome = jax.vmap(task.step, (None, 0, 0))(key, states, action)
+            return states, (jax.vmap(task.observe)(states), outcome.reward)
+
+        return jax.lax.scan(step, states, length=HOLD)
+
+    states = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.key(0), num_worlds))
+    begin = time.perf_counter()
+    program = advance.lower(states, jax.random.key(1)).compile()
+    compile_seconds = time.perf_counter() - begin
+    states, _ = jax.block_until_ready(program(states, jax.random.key(1)))
+    steps, start = 0, time.process_time()
+    while time.process_time() - start < seconds:
+        states, _ = jax.block_until_ready(program(states, jax.random.key(steps)))
+        steps += HOLD * num_worlds
+    return steps / (time.process_time() - start), compile_seconds
+
+
+def main(words: list[str]) -> None:
+    settings = {"worlds": "1,64,1024", "seconds": "2", "physics": "faithful"}
+    settings |= dict(word.split("=", 1) for word in words)
+    seconds = float(settings["seconds"])
+    versions = {name: importlib.metadata.version(name) for name in ("jaxswarm", "jax", "jaxlib", "Box2D")}
+    for (num_agents, num_boxes, side), kind in itertools.product(SCENES, ("physics", "environment")):
+        task = Assembly(num_agents=num_agents, num_boxes=num_boxes, side=side, physics=settings["physics"])
+        is_environment = kind == "environment"
+        box2d = box2d_rate(task, is_environment, seconds)
+        for num_worlds in map(int, settings["worlds"].split(",")):
+            rate, compile_seconds = jaxswarm_rate(task, num_worlds, is_environment, seconds)
+            row = {
+                "benchmark": "box_physics",
+                "kind": kind,
+                "robots": num_agents,
+                "boxes": num_boxes,
+                "physics": settings["physics"],
+                "worlds": num_worlds,
+                "steps_per_cpu_second": rate,
+                "box2d_steps_per_cpu_second": box2d,
+                "ratio": rate / box2d,
+                "compile_seconds": compile_seconds,
+                "versions": versions,
+                "device": jax.devices()[0].device_kind,
+                "platform": platform.platform(),
+            }
+            print(json.dumps({key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in row.items()}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
