@@ -77,7 +77,7 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("learning_rate=3", ["did you mean 'learner.learning_rate'"]),
         ("learner.learning_rat=3", ["did you mean 'learner.learning_rate'", "learner.clip_range"]),
         ("seed.x=3", ["'seed.x'"]),
-        ("task=rendevous", ["did you mean 'rendezvous'", "accepted: rendezvous"]),
+        ("task=rendevous", ["did you mean 'rendezvous'", ", rendezvous"]),
         ("learner=x", ["'x'", "accepted: ppo, ppo_thesis"]),
         ("task.name=x", ["task.name", "'x'", "rendezvous"]),
         ("learner.learning_rate=fast", ["learner.learning_rate", "'fast'", "a number"]),

@@ -13,8 +13,9 @@ PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types"},
     {"geometry", "sets", "distributions"},
-    {"dynamics", "aggregators"},
-    {"tasks.rendezvous", "networks"},
+    {"dynamics", "neighbors", "aggregators"},
+    {"tasks.swarm", "tasks.evasion", "networks"},
+    {"tasks.rendezvous", "tasks.pursuit"},
     {"tasks"},
     {"rollout"},
     {"learners.on_policy"},
@@ -27,7 +28,7 @@ FLOORS = [
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
-WINGS = ({"geometry", "dynamics", "tasks"}, {"sets", "distributions", "aggregators", "networks"})
+WINGS = ({"geometry", "dynamics", "neighbors", "tasks"}, {"sets", "distributions", "aggregators", "networks"})
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")

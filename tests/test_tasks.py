@@ -12,11 +12,26 @@ from jaxswarm.types import Observation
 
 NUM_AGENTS, EPISODE_LENGTH, NUM_WORLDS = 4, 6, 3
 KEY = jax.random.key(1)
+VARIANTS = {
+    "as they are": {},
+    "numbers vary": {"active_agents": (2, NUM_AGENTS - 1)},
+    "nearest only": {"max_neighbors": 2, "visibility_radius": 60.0},
+}
 
 
-@pytest.fixture(params=TASKS)
+def has_fields(cls, fields):
+    return fields.keys() <= {field.name for field in dataclasses.fields(cls)}
+
+
+@pytest.fixture(
+    params=[
+        (task, variant) for task in TASKS for variant, fields in VARIANTS.items() if has_fields(TASKS[task], fields)
+    ],
+    ids=" ".join,
+)
 def task(request):
-    return TASKS[request.param](num_agents=NUM_AGENTS, episode_length=EPISODE_LENGTH)
+    name, variant = request.param
+    return TASKS[name](num_agents=NUM_AGENTS, episode_length=EPISODE_LENGTH, **VARIANTS[variant])
 
 
 @jax.jit
@@ -82,7 +97,7 @@ def test_observations_have_an_own_part_and_masked_groups(task):
         assert group.mask.dtype == jnp.bool
 
 
-@pytest.mark.parametrize("num_agents", [2, 9])
+@pytest.mark.parametrize("num_agents", [3, 9])
 def test_any_number_of_agents_gives_features_of_the_same_size(task, num_agents):
     other = task.replace(num_agents=num_agents)
     obs, other_obs = observe(task, reset(task, KEY)), observe(other, reset(other, KEY))
@@ -94,10 +109,13 @@ def test_any_number_of_agents_gives_features_of_the_same_size(task, num_agents):
 
 
 def test_everything_stays_finite(task):
+    """But metrics, which are NaN where they say nothing."""
     state, actions = reset(task, KEY), random_actions(task, 50)
     for action in actions:
         state, outcome = step(task, KEY, state, action)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, outcome, observe(task, state))))
+        finite = (state, outcome.reward, observe(task, state))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(finite))
+        assert not any(np.isinf(metric) for metric in outcome.metrics.values())
 
 
 def test_the_time_limit_truncates_at_exactly_the_episode_length(task):
@@ -111,9 +129,16 @@ def test_the_time_limit_truncates_at_exactly_the_episode_length(task):
 def test_one_agent_perceives_what_all_observe(task):
     state = reset(task, KEY)
     view, obs, perceive = jax.jit(task.view)(state), observe(task, state), jax.jit(task.perceive)
-    assert all(leaf.shape[0] == NUM_AGENTS for leaf in jax.tree.leaves(view))
     for agent in range(NUM_AGENTS):
         assert_close(perceive(view, jnp.array(agent)), jax.tree.map(lambda leaf, i=agent: leaf[i], obs))
+
+
+def test_views_are_at_most_as_many_numbers_as_there_are_agents(task):
+    def size(num_agents):
+        larger = task.replace(num_agents=num_agents)
+        return sum(x.size for x in jax.tree.leaves(jax.eval_shape(lambda: larger.view(larger.reset(KEY)))))
+
+    assert size(40) <= 2 * size(20)
 
 
 def test_observations_are_functions_of_the_state(task):

@@ -1,5 +1,6 @@
 """The tasks, by name."""
 
+from jaxswarm.tasks.pursuit import Pursuit
 from jaxswarm.tasks.rendezvous import Rendezvous
 
-TASKS = {"rendezvous": Rendezvous}
+TASKS = {"rendezvous": Rendezvous, "pursuit": Pursuit}
