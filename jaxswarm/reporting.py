@@ -29,7 +29,6 @@ SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal to draw a bar on
 
 def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
     """Versions, device, revision and the exact arithmetic of steps."""
-    device = jax.devices()[0]
     per_update = experiment.agent_steps_per_update
     steps = {
         "updates": num_updates,
@@ -52,6 +51,13 @@ def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
         "command": sys.argv,
         "seeds": [seed],
         "steps": steps,
+    } | provenance()
+
+
+def provenance() -> dict[str, Any]:
+    """What code ran on what machine."""
+    device = jax.devices()[0]
+    return {
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES},
         "platform": platform.platform(),
         "device": {"backend": device.platform, "kind": device.device_kind, "count": jax.device_count()},
