@@ -172,48 +172,51 @@ def _solve_kl(
     divergence = kl(std, old_std)
     is_outside = (divergence > bound)[..., None]
     a = jnp.where(is_outside, (old_std - std) * (old_std + std) / jnp.square(std), 1.0)
-    s = _root(a, bound, divergence < 2.0 * bound)[..., None]
+    s = _root(jnp.moveaxis(a, -1, 0), bound, divergence < 2.0 * bound)[..., None]
     u = s * a
     return jnp.where(is_outside, old_std * jax.lax.rsqrt(1.0 + u), std), is_outside, s, u / (1.0 + u)
 
 
-def _root(
-    a: Float[Array, "*batch dim"], bound: Bound, is_near_one: Bool[Array, "*batch"]
-) -> Float[Array, "*batch"]:
+def _root(a: Float[Array, "dim *batch"], bound: Bound, is_near_one: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The s in (0, 1] where h(s) = half the sum of log1p(s a) - s a / (1 + s a) is the bound; a > -1.
 
     h grows with s from h(0) = 0. Newton's steps for ln h as a function of y = ln s, corrected for its curvature (Halley),
     in a bracket; a step that leaves the bracket becomes a bisection. A root near the bracket's upper end is approached
     from there, as steps beyond it would never end. With u = s a and t = u / (1 + u), two derivatives are almost free:
     dh / dy = sum t^2 / 2, whose derivative is sum t^2 (1 - t).
+
+    Dimensions come first, and the steps are a loop: three to five times as fast on a CPU as the opposites.
     """
-    low, high = _bracket(a, bound)
-    y = jnp.where(is_near_one, high, 0.5 * (low + high))
-    for _ in range(NUM_STEPS):
-        u = jnp.exp(y)[..., None] * a
+
+    def step(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        low, high, y = state
+        u = jnp.exp(y)[None] * a
         t = u / (1.0 + u)
         square = jnp.square(t)
-        h = 0.5 * _divergence(t, jnp.log1p(u)).sum(-1)
+        h = 0.5 * _divergence(t, jnp.log1p(u)).sum(0)
         excess = jnp.log(h / bound)
-        slope = 0.5 * square.sum(-1) / h
-        curvature = (square * (1.0 - t)).sum(-1) / h - jnp.square(slope)
+        slope = 0.5 * square.sum(0) / h
+        curvature = (square * (1.0 - t)).sum(0) / h - jnp.square(slope)
         low, high = jnp.where(excess > 0, low, y), jnp.where(excess > 0, y, high)
         newton = excess / slope
         y = y - newton / (1.0 - 0.5 * newton * curvature / slope)
-        y = jnp.where((y >= low) & (y <= high), y, 0.5 * (low + high))
-    return jnp.exp(y)
+        return low, high, jnp.where((y >= low) & (y <= high), y, 0.5 * (low + high))
+
+    low, high = _bracket(a, bound)
+    start = jnp.where(is_near_one, high, 0.5 * (low + high))
+    return jnp.exp(jax.lax.fori_loop(0, NUM_STEPS, step, (low, high, start))[2])
 
 
-def _bracket(a: Float[Array, "*batch dim"], bound: Bound) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+def _bracket(a: Float[Array, "dim *batch"], bound: Bound) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """Logarithms of numbers below and above the root, which for small bounds are 4 sqrt(bound) apart.
 
     They follow from u^2 / (1 + p)^2 <= 2 (log1p(u) - t) <= u^2 / (1 - n)^2 for u in [-n, p], and for the largest u from
     log1p(u) - 1 < log1p(u) - t.
     """
     tiny = jnp.finfo(a.dtype).tiny
-    positive, negative = jnp.maximum(a.max(-1), 0.0), jnp.maximum(-a.min(-1), 0.0)
+    positive, negative = jnp.maximum(a.max(0), 0.0), jnp.maximum(-a.min(0), 0.0)
     scale = jnp.maximum(positive, negative)  # squares of unscaled numbers would overflow
-    s = 2.0 * jnp.sqrt(bound / jnp.square(a / scale[..., None]).sum(-1)) / scale
+    s = 2.0 * jnp.sqrt(bound / jnp.square(a / scale[None]).sum(0)) / scale
     room = 1.0 - s * positive
     high = jnp.where(room > 0.0, s / jnp.maximum(room, tiny), jnp.inf)
     high = jnp.minimum(jnp.minimum(high, jnp.expm1(2.0 * bound + 1.0) / jnp.maximum(positive, tiny)), 1.0)
