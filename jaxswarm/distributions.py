@@ -9,4 +9,9 @@ Policy = distrax.MultivariateNormalDiag
 
 def gaussian(mean: Float[Array, "*batch dim"], log_std: Float[Array, "*#batch dim"]) -> Policy:
     """Diagonal Gaussian with mean and log standard deviation."""
-    return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))
+    return gaussian_with_std(mean, jnp.exp(log_std))
+
+
+def gaussian_with_std(mean: Float[Array, "*batch dim"], std: Float[Array, "*#batch dim"]) -> Policy:
+    """Diagonal Gaussian with mean and standard deviation."""
+    return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))

@@ -1,6 +1,7 @@
 """Networks: an encoder per group, an aggregator, a decoder, and the heads of actor and critic."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
@@ -83,10 +84,12 @@ class Tower(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """Actor and critic as two separate towers, shared by all agents; the standard deviation depends on no state.
+    """Actor and critic as two separate towers, shared by all agents.
 
-    `encoder` and `decoder` are layer widths; the last encoder width is the size of an aggregate. Initialisation:
-    orthogonal with gain sqrt(2) inside, 0.01 for the action mean, 1 for the value, log standard deviation 0.
+    `encoder` and `decoder` are layer widths; the last encoder width is the size of an aggregate. The log standard
+    deviation of actions is one parameter, the same in all states, or with `std="state"` a second head of the actor.
+    Initialisation: orthogonal with gain sqrt(2) inside, 0.01 for the action mean and for the head of the log standard
+    deviation, 1 for the value, shared log standard deviation 0.
     """
 
     encoder: tuple[int, ...] = (64,)
@@ -94,6 +97,7 @@ class ActorCritic(nn.Module):
     activation: Literal["leaky_relu", "relu", "tanh"] = "leaky_relu"
     aggregator: nn.Module = Mean()
     latent_space: Literal["separate", "shared"] = "separate"
+    std: Literal["shared", "state"] = "shared"
     action_dim: int = 2
 
     def setup(self) -> None:  # noqa: D102
@@ -102,7 +106,10 @@ class ActorCritic(nn.Module):
         self.critic = tower()
         self.action_mean = nn.Dense(self.action_dim, kernel_init=nn.initializers.orthogonal(0.01))
         self.value_head = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0))
-        self.log_std = self.param("log_std", nn.initializers.zeros, (self.action_dim,))
+        if self.std == "state":
+            self.action_log_std = nn.Dense(self.action_dim, kernel_init=nn.initializers.orthogonal(0.01))
+        else:
+            self.log_std = self.param("log_std", nn.initializers.zeros, (self.action_dim,))
 
     def __call__(self, obs: Observation) -> tuple[Policy, Float[Array, "*receivers"]]:
         """Policy and value of every receiver; `obs` may have any leading axes."""
@@ -112,11 +119,18 @@ class ActorCritic(nn.Module):
         """Action distribution of every receiver."""
         latent = self.actor(*_flat(obs))
         mean = self.action_mean(latent).reshape(*obs.own.shape[:-1], self.action_dim)
+        if self.std == "state":
+            return gaussian(mean, self.action_log_std(latent).reshape(mean.shape))
         return gaussian(mean, self.log_std.reshape([1] * (mean.ndim - 1) + [-1]))
 
     def value(self, obs: Observation) -> Float[Array, "*receivers"]:
         """Value estimate of every receiver."""
         return self.value_head(self.critic(*_flat(obs))).reshape(obs.own.shape[:-1])
+
+
+def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:
+    """The parameters of an `ActorCritic` with `std="shared"`, with another log standard deviation."""
+    return params | {"params": params["params"] | {"log_std": function(params["params"]["log_std"])}}
 
 
 def _flat(obs: Observation) -> tuple[Float[Array, "n own_dim"], dict[str, Entities]]:

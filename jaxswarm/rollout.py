@@ -23,6 +23,8 @@ class Trajectory:
     state: Any
     action: Float[Array, "steps worlds agents action_dim"]  # as sampled, not clipped
     log_prob: Float[Array, "steps worlds agents"]
+    action_mean: Float[Array, "steps worlds agents action_dim"]  # of the policy that acted
+    action_std: Float[Array, "steps worlds agents action_dim"]
     reward: Float[Array, "steps worlds"]
     terminated: Bool[Array, "steps worlds"]
     truncated: Bool[Array, "steps worlds"]
@@ -72,6 +74,8 @@ def collect(
             worlds.state,
             action,
             distribution.log_prob(action),
+            distribution.mean(),
+            distribution.stddev(),
             outcome.reward,
             outcome.terminated,
             outcome.truncated,

@@ -74,7 +74,7 @@ def test_recorded_update(meta, arrays):
     def update(state):
         loss = lambda params, batch: learner.loss(model, params, batch)  # noqa: E731
         fetch = lambda order: jax.tree.map(lambda x: x[order], batch)  # noqa: E731
-        optimizer = learner._optimizer()
+        optimizer = on_policy.adam(learner)
         return on_policy.descend(
             jax.random.key(0), loss, fetch, optimizer, state, meta["batch_size"], 1, meta["n_epochs"]
         )

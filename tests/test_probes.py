@@ -1,41 +1,21 @@
 """Every learner finds the known values and best actions of the probe tasks."""
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
-from probes import PROBES, State
-
-import jaxswarm
-from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
-
-OPTIONS = {"num_epochs": 8, "batch_size": 64, "learning_rate": 3e-3, "discount": 0.5}
-NETWORK = ActorCritic(encoder=(8,), decoder=(16,), aggregator=AGGREGATORS["mean"](), action_dim=1)
+from probes import CASES, OPTIONS, look, train_probes
 
 
-@pytest.fixture(scope="module", params=LEARNERS)
+@pytest.fixture(scope="module", params=CASES, ids=["-".join(filter(None, case)) for case in CASES])
 def outputs(request):
     """Action and value by (probe, cue, time) after training all probes side by side."""
-    learner = LEARNERS[request.param](**OPTIONS)
-    sizes = {"num_worlds": 64, "num_steps": 2, "eval_worlds": 8, "eval_every": 20}
-
-    def train(task):
-        experiment = Experiment(task, NETWORK, learner, **sizes)
-        state, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 40)
-        return state.learner.params, metrics["eval/return"]
-
-    tasks = jax.tree.map(lambda *x: jnp.array(x), *PROBES.values())
-    params, returns = jax.jit(jax.vmap(train))(tasks)
-
-    def look(params, cue, time):
-        policy, value = NETWORK.apply(params, next(iter(PROBES.values())).observe(State(jnp.full((2,), cue), time)))
-        return policy.mean()[0, 0], value[0]
+    results = train_probes(*request.param)
 
     def output(probe, cue, time):
-        one = jax.tree.map(lambda x: x[list(PROBES).index(probe)], params)
-        return [float(x) for x in look(one, float(cue), jnp.int32(time))]
+        params = jax.tree.map(lambda x: x[-1], results[probe][0])
+        policy, value = look(params, cue, time)
+        return float(policy.mean()[0]), float(value)
 
-    output.returns = dict(zip(PROBES, np.asarray(returns), strict=True))
+    output.returns = {probe: returns for probe, (_, returns) in results.items()}
     return output
 
 

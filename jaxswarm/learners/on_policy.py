@@ -1,11 +1,12 @@
-"""What on-policy learners share: values, advantages, samples, and descent by minibatches.
+"""What on-policy learners share: hyper-parameters, values, advantages, samples, and descent by minibatches.
 
 Every agent's step is a sample of its own, with the common reward and that agent's own value. Samples are numbered
 [steps, worlds, agents] in this order.
 """
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,43 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.rollout import Trajectory
-from jaxswarm.types import Key, Metrics, Observation, pytree
+from jaxswarm.types import Key, Metrics, Observation, is_whole, pytree, require, static
 
 Params = Any
+
+
+@pytree
+class OnPolicy:
+    """Hyper-parameters of every on-policy learner.
+
+    A minibatch has `batch_size` samples: rows of single agents drawn at random, or those of all agents of randomly
+    drawn worlds, which is faster because the agents of a world share most of the work of perceiving it. With
+    `bootstrap_truncation` the value of the last state stands for what would have come after a time limit; without,
+    a time limit counts as the end of the world, as in the thesis.
+    """
+
+    learning_rate: float = 3e-3
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    value_coefficient: float = 0.5
+    entropy_coefficient: float = 0.0
+    max_gradient_norm: float = 0.5
+    adam_epsilon: float = 1e-5
+    num_epochs: int = static(default=2)
+    batch_size: int = static(default=1280)
+    minibatch: Literal["agents", "worlds"] = static(default="worlds")
+    bootstrap_truncation: bool = static(default=True)
+
+
+def check(learner: OnPolicy) -> None:
+    """A `ValueError` names the first of these hyper-parameters that is not possible."""
+    positive = ("learning_rate", "max_gradient_norm", "adam_epsilon")
+    require(learner, "positive numbers", lambda x: x > 0, *positive)
+    require(learner, "numbers from 0 to 1", lambda x: 0 <= x <= 1, "discount", "gae_lambda")
+    require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
+    require(learner, "whole numbers from 1", is_whole(1), "num_epochs")
+    require(learner, "whole numbers from 2", is_whole(2), "batch_size")
+    require(learner, "agents, worlds", lambda x: x in ("agents", "worlds"), "minibatch")
 
 
 @pytree
@@ -35,6 +70,8 @@ class Batch:
     log_prob: Float[Array, " rows"]  # of the action under the policy that took it
     advantage: Float[Array, " rows"]
     target: Float[Array, " rows"]  # for the value
+    action_mean: Float[Array, "rows action_dim"] | None = None  # of the policy that took it, for those who ask
+    action_std: Float[Array, "rows action_dim"] | None = None
 
 
 @pytree
@@ -46,9 +83,45 @@ class Samples:
     log_prob: Float[Array, " samples"]
     advantage: Float[Array, " samples"]
     target: Float[Array, " samples"]
+    action_mean: Float[Array, "samples action_dim"]
+    action_std: Float[Array, "samples action_dim"]
 
 
 Loss = Callable[[Params, Batch], tuple[Array, Metrics]]
+
+
+def adam(learner: OnPolicy) -> optax.GradientTransformation:
+    """Adam, on shortened gradients."""
+    return optax.chain(
+        optax.clip_by_global_norm(learner.max_gradient_norm),
+        optax.adam(learner.learning_rate, eps=learner.adam_epsilon),
+    )
+
+
+def update(
+    learner: OnPolicy, loss: Loss, key: Key, state: LearnerState, network: Any, task: Any, trajectory: Trajectory
+) -> tuple[LearnerState, Metrics]:
+    """Descends `loss` on the samples of one trajectory, all epochs."""
+    value, next_value = trajectory_values(network, state.params, task, trajectory)
+    is_done = trajectory.terminated | trajectory.truncated
+    is_terminal = trajectory.terminated if learner.bootstrap_truncation else is_done
+    advantage = generalized_advantages(
+        trajectory.reward, is_terminal, is_done, value, next_value, learner.discount, learner.gae_lambda
+    )
+    target = advantage + value
+    samples = stored_samples(task, trajectory, advantage, target)
+    num_samples = advantage.size
+    state, metrics = descend(
+        key,
+        loss,
+        partial(FETCH[learner.minibatch], task, samples),
+        adam(learner),
+        state,
+        num_samples if learner.minibatch == "agents" else num_samples // task.num_agents,
+        num_samples // learner.batch_size,
+        learner.num_epochs,
+    )
+    return state, metrics | {"explained_variance": explained_variance(value, target)}
 
 
 def trajectory_values(
@@ -102,7 +175,8 @@ def stored_samples(
 ) -> Samples:
     """All samples of a trajectory."""
     views = jax.vmap(jax.vmap(task.view))(trajectory.state)
-    arrays = (trajectory.action, trajectory.log_prob, advantage, target)
+    policy = (trajectory.action_mean, trajectory.action_std)
+    arrays = (trajectory.action, trajectory.log_prob, advantage, target, *policy)
     return Samples(jax.tree.map(_merge, views), *[_merge(_merge(x)) for x in arrays])
 
 
@@ -124,7 +198,8 @@ FETCH = {"agents": fetch_agents, "worlds": fetch_worlds}
 
 
 def _batch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) -> Batch:
-    arrays = (samples.action, samples.log_prob, samples.advantage, samples.target)
+    policy = (samples.action_mean, samples.action_std)
+    arrays = (samples.action, samples.log_prob, samples.advantage, samples.target, *policy)
     return Batch(obs, *[x[sample] for x in arrays])
 
 
@@ -159,22 +234,36 @@ def descend(
 ) -> tuple[LearnerState, Metrics]:
     """Minibatch gradient descent; each epoch goes through all units once, in a fresh random order.
 
-    The metrics are means over all minibatches.
+    The metrics are means over all minibatches; those called `..._max` are maxima.
     """
+
+    def over(metrics: Metrics) -> Metrics:
+        return {name: (jnp.max if name.endswith("_max") else jnp.mean)(x) for name, x in metrics.items()}
 
     def minibatch(state: LearnerState, units: Int[Array, " units"]) -> tuple[LearnerState, Metrics]:
         gradient, metrics = jax.grad(loss, has_aux=True)(state.params, fetch(units))
         updates, optimizer_state = optimizer.update(gradient, state.optimizer_state, state.params)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
-        return LearnerState(optax.apply_updates(state.params, updates), optimizer_state), metrics
+        params = optax.apply_updates(state.params, updates)
+        return state.replace(params=params, optimizer_state=optimizer_state), metrics
 
     def epoch(state: LearnerState, key: Key) -> tuple[LearnerState, Metrics]:
         order = shuffled(key, num_minibatches, num_units // num_minibatches)
         state, metrics = jax.lax.scan(minibatch, state, order)
-        return state, jax.tree.map(jnp.mean, metrics)
+        return state, over(metrics)
 
     state, metrics = jax.lax.scan(epoch, state, jax.random.split(key, num_epochs))
-    return state, jax.tree.map(jnp.mean, metrics)
+    return state, over(metrics)
+
+
+def standardised(advantage: Float[Array, " rows"]) -> Float[Array, " rows"]:
+    """Advantages of a minibatch with mean 0 and sample standard deviation 1."""
+    return (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
+
+
+def squared_error(value: Float[Array, " rows"], target: Float[Array, " rows"]) -> Float[Array, ""]:
+    """Loss of the values."""
+    return jnp.square(value - target).mean()
 
 
 def explained_variance(value: Float[Array, "..."], target: Float[Array, "..."]) -> Float[Array, ""]:
