@@ -42,10 +42,12 @@ def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
         "evaluations": math.ceil(num_updates / experiment.eval_every) + 1,
         "episodes_per_evaluation": experiment.eval_worlds,
     }
-    learner = experiment.learner
-    if hasattr(learner, "num_epochs") and hasattr(learner, "batch_size"):
-        gradient_steps = learner.num_epochs * per_update // learner.batch_size
-        steps |= {"gradient_steps_per_update": gradient_steps, "gradient_steps": num_updates * gradient_steps}
+    gradient_steps = experiment.learner.num_epochs * per_update // experiment.batch_size
+    steps |= {
+        "samples_per_gradient_step": experiment.batch_size,
+        "gradient_steps_per_update": gradient_steps,
+        "gradient_steps": num_updates * gradient_steps,
+    }
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "command": sys.argv,

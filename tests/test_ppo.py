@@ -91,5 +91,5 @@ def test_recorded_update(meta, arrays):
     assert float(metrics["policy_loss"]) == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
     assert float(metrics["entropy"]) == pytest.approx(-logged["train/entropy_loss"], rel=1e-5)
     assert float(metrics["approx_kl"]) == pytest.approx(logged["train/approx_kl"], abs=1e-6)
-    explained = on_policy.explained_variance(jnp.asarray(arrays["values"]), jnp.asarray(arrays["returns"]))
+    explained = on_policy.explained_variance(jnp.asarray(arrays["values"]), jnp.asarray(arrays["returns"]), None)
     assert float(explained) == pytest.approx(logged["train/explained_variance"], abs=1e-3)

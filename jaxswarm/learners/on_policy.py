@@ -1,7 +1,7 @@
 """What on-policy learners share: hyper-parameters, values, advantages, samples, and descent by minibatches.
 
 Every agent's step is a sample of its own, with the common reward and that agent's own value. Samples are numbered
-[steps, worlds, agents] in this order.
+[steps, worlds, agents] in this order. Those of agents that did not exist have no influence on any loss.
 """
 
 from collections.abc import Callable
@@ -17,14 +17,17 @@ from jaxswarm.rollout import Trajectory
 from jaxswarm.types import Key, Metrics, Observation, is_whole, pytree, require, static
 
 Params = Any
+Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
+
+USUAL_BATCH_SIZE = 1280
 
 
 @pytree
 class OnPolicy:
     """Hyper-parameters of every on-policy learner.
 
-    A minibatch has `batch_size` samples: rows of single agents drawn at random, or those of all agents of randomly
-    drawn worlds, which is faster because the agents of a world share most of the work of perceiving it. With
+    A minibatch has `batch_size` samples, or the possible number nearest to 1280: rows of single agents drawn at random,
+    or those of all agents of randomly drawn worlds, which is faster because they share most of the perceiving. With
     `bootstrap_truncation` the value of the last state stands for what would have come after a time limit; without,
     a time limit counts as the end of the world, as in the thesis.
     """
@@ -37,7 +40,7 @@ class OnPolicy:
     max_gradient_norm: float = 0.5
     adam_epsilon: float = 1e-5
     num_epochs: int = static(default=2)
-    batch_size: int = static(default=1280)
+    batch_size: int | None = static(default=None)
     minibatch: Literal["agents", "worlds"] = static(default="worlds")
     bootstrap_truncation: bool = static(default=True)
 
@@ -49,8 +52,23 @@ def check(learner: OnPolicy) -> None:
     require(learner, "numbers from 0 to 1", lambda x: 0 <= x <= 1, "discount", "gae_lambda")
     require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
     require(learner, "whole numbers from 1", is_whole(1), "num_epochs")
-    require(learner, "whole numbers from 2", is_whole(2), "batch_size")
+    require(learner, "null, whole numbers from 2", lambda x: x is None or is_whole(2)(x), "batch_size")
     require(learner, "agents, worlds", lambda x: x in ("agents", "worlds"), "minibatch")
+
+
+def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
+    """Samples per gradient step; a `ValueError` says which sizes are possible if the one asked for is not."""
+    asked, unit = learner.batch_size, 1 if learner.minibatch == "agents" else num_agents
+    if asked and num_samples % asked == 0 and asked % unit == 0:
+        return asked
+    possible = [n for n in range(unit, num_samples + 1, unit) if num_samples % n == 0 and n > 1]
+    nearest = sorted(possible, key=lambda n: abs(n - (asked or USUAL_BATCH_SIZE)))[:4]
+    if asked is None:
+        return nearest[0]
+    raise ValueError(
+        f"batch_size = {asked} is not possible; accepted: divisors of num_worlds * num_steps * num_agents = "
+        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest)))}"
+    )
 
 
 @pytree
@@ -102,7 +120,7 @@ def update(
     learner: OnPolicy, loss: Loss, key: Key, state: LearnerState, network: Any, task: Any, trajectory: Trajectory
 ) -> tuple[LearnerState, Metrics]:
     """Descends `loss` on the samples of one trajectory, all epochs."""
-    value, next_value = trajectory_values(network, state.params, task, trajectory)
+    value, next_value, existing = trajectory_values(network, state.params, task, trajectory)
     is_done = trajectory.terminated | trajectory.truncated
     is_terminal = trajectory.terminated if learner.bootstrap_truncation else is_done
     advantage = generalized_advantages(
@@ -118,29 +136,30 @@ def update(
         adam(learner),
         state,
         num_samples if learner.minibatch == "agents" else num_samples // task.num_agents,
-        num_samples // learner.batch_size,
+        num_samples // batch_size(learner, num_samples, task.num_agents),
         learner.num_epochs,
     )
-    return state, metrics | {"explained_variance": explained_variance(value, target)}
+    return state, metrics | {"explained_variance": explained_variance(value, target, existing)}
 
 
 def trajectory_values(
     network: Any, params: Params, task: Any, trajectory: Trajectory
-) -> tuple[Float[Array, "steps worlds agents"], Float[Array, "steps worlds agents"]]:
-    """Values of the state before each step, and of the state after it, before any reset."""
+) -> tuple[Float[Array, "steps worlds agents"], Float[Array, "steps worlds agents"], Mask]:
+    """Values of the state before each step and of the state after it, before any reset; and which agents exist."""
 
-    def value(state: Any) -> Array:
-        return network.apply(params, jax.vmap(task.observe)(state), method="value")
+    def value_and_mask(state: Any) -> tuple[Array, Array | None]:
+        obs = jax.vmap(task.observe)(state)
+        return network.apply(params, obs, method="value"), obs.mask
 
     def value_after(step: tuple) -> Array:
         """Where no episode ended, the state after this step is the one before the next; the last step has no next."""
         is_known, final_state, following = step
-        return jax.lax.cond(is_known, lambda: following, lambda: value(final_state))
+        return jax.lax.cond(is_known, lambda: following, lambda: value_and_mask(final_state)[0])
 
-    values = jax.lax.map(value, trajectory.state)
+    values, mask = jax.lax.map(value_and_mask, trajectory.state)
     is_known = ~(trajectory.terminated | trajectory.truncated).any(-1)
     is_known = is_known.at[-1].set(False)
-    return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0)))
+    return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0))), mask
 
 
 def generalized_advantages(
@@ -256,16 +275,35 @@ def descend(
     return state, over(metrics)
 
 
-def standardised(advantage: Float[Array, " rows"]) -> Float[Array, " rows"]:
+def mean(x: Float[Array, "*#rows"], mask: Mask) -> Float[Array, ""]:
+    """Mean over the rows that exist."""
+    if mask is None:
+        return x.mean()
+    return jnp.where(mask, x, 0.0).sum() / jnp.maximum(mask.sum(), 1)
+
+
+def maximum(x: Float[Array, "#rows"], mask: Mask) -> Float[Array, ""]:
+    """Maximum over the rows that exist, of numbers that are not negative."""
+    return x.max() if mask is None else jnp.where(mask, x, 0.0).max()
+
+
+def standardised(advantage: Float[Array, " rows"], mask: Mask) -> Float[Array, " rows"]:
     """Advantages of a minibatch with mean 0 and sample standard deviation 1."""
-    return (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
+    num_rows = advantage.size if mask is None else mask.sum()
+    centred = advantage - mean(advantage, mask)
+    variance = mean(jnp.square(centred), mask) * (num_rows / jnp.maximum(num_rows - 1, 1))
+    return centred / (jnp.sqrt(variance) + 1e-8)
 
 
-def squared_error(value: Float[Array, " rows"], target: Float[Array, " rows"]) -> Float[Array, ""]:
+def squared_error(value: Float[Array, " rows"], target: Float[Array, " rows"], mask: Mask) -> Float[Array, ""]:
     """Loss of the values."""
-    return jnp.square(value - target).mean()
+    return mean(jnp.square(value - target), mask)
 
 
-def explained_variance(value: Float[Array, "..."], target: Float[Array, "..."]) -> Float[Array, ""]:
+def explained_variance(value: Float[Array, "*rows"], target: Float[Array, "*rows"], mask: Mask) -> Float[Array, ""]:
     """1 for perfect values, 0 for a constant, negative for worse; NaN if there is nothing to explain."""
-    return 1.0 - jnp.var(target - value) / jnp.var(target)
+
+    def variance(x: Array) -> Array:
+        return mean(jnp.square(x - mean(x, mask)), mask)
+
+    return 1.0 - variance(target - value) / variance(target)

@@ -1,5 +1,6 @@
 """Proximal policy optimisation with clipping (Schulman et al., 2017)."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -39,20 +40,21 @@ class PPO(OnPolicy):
     def loss(self, network: Any, params: Params, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
         """Clipped surrogate, squared value error and entropy bonus of a minibatch; advantages are normalised in it."""
         policy, value = network.apply(params, batch.obs)
+        mean = partial(on_policy.mean, mask=batch.obs.mask)
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
-        advantage = on_policy.standardised(batch.advantage)
+        advantage = on_policy.standardised(batch.advantage, batch.obs.mask)
         clipped = jnp.clip(ratio, 1.0 - self.clip_range, 1.0 + self.clip_range)
-        policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-        value_loss = on_policy.squared_error(value, batch.target)
-        entropy = policy.entropy().mean()
+        policy_loss = -mean(jnp.minimum(ratio * advantage, clipped * advantage))
+        value_loss = on_policy.squared_error(value, batch.target, batch.obs.mask)
+        entropy = mean(policy.entropy())
         metrics = {
             "policy_loss": policy_loss,
             "value_loss": value_loss,
             "entropy": entropy,
-            "approx_kl": (ratio - 1.0 - log_ratio).mean(),
-            "clip_fraction": (jnp.abs(ratio - 1.0) > self.clip_range).mean(),
-            "policy_std": policy.stddev().mean(),
+            "approx_kl": mean(ratio - 1.0 - log_ratio),
+            "clip_fraction": mean((jnp.abs(ratio - 1.0) > self.clip_range).astype(jnp.float32)),
+            "policy_std": mean(policy.stddev().mean(-1)),
         }
         loss = policy_loss + self.value_coefficient * value_loss - self.entropy_coefficient * entropy
         return loss, jax.lax.stop_gradient(metrics)

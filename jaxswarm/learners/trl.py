@@ -1,5 +1,6 @@
 """Policy gradients within trust region layers (Otto et al., 2021)."""
 
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -108,6 +109,8 @@ class TRL(OnPolicy):
     ) -> tuple[Float[Array, ""], Metrics]:
         """Surrogate, regression loss, squared value error and entropy bonus of a minibatch."""
         policy, value = network.apply(params, batch.obs)
+        mask = batch.obs.mask
+        average, most = (partial(reduce, mask=mask) for reduce in (on_policy.mean, on_policy.maximum))
         rows = slice(1) if network.std == "shared" else slice(None)  # of which the others are copies
         mean, std = policy.mean(), policy.stddev()[rows]
         old_mean, old_std = batch.action_mean, batch.action_std[rows]
@@ -118,29 +121,30 @@ class TRL(OnPolicy):
             policy = gaussian_with_std(projected_mean, projected_std)
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
-        policy_loss = -(ratio * on_policy.standardised(batch.advantage)).mean()
-        value_loss = on_policy.squared_error(value, batch.target)
+        policy_loss = -average(ratio * on_policy.standardised(batch.advantage, mask))
+        value_loss = on_policy.squared_error(value, batch.target, mask)
         goal = jax.lax.stop_gradient((projected_mean, projected_std))
         regression = self.layer.mean_part(mean, *goal)
         if network.std == "state":
             regression += self.layer.cov_part(std, goal[1])
-        regression_loss = self.coefficient * regression.mean()
-        bonus = policy.entropy().mean()
+        regression_loss = self.coefficient * average(regression)
+        bonus = average(policy.entropy())
 
         mean_part = self.layer.mean_part(mean, old_mean, old_std)
         cov_part = self.layer.cov_part(std, old_std)
+        is_outside = (mean_part > self.mean_bound) | (cov_part > self.cov_bound)
         metrics = {
             "policy_loss": policy_loss,
             "value_loss": value_loss,
             "regression_loss": regression_loss,
             "entropy": bonus,
-            "approx_kl": (ratio - 1.0 - log_ratio).mean(),
-            "policy_std": policy.stddev().mean(),
-            "mean_part": mean_part.mean(),
-            "mean_part_max": mean_part.max(),
-            "cov_part": cov_part.mean(),
-            "cov_part_max": cov_part.max(),
-            "projected_fraction": ((mean_part > self.mean_bound) | (cov_part > self.cov_bound)).mean(),
+            "approx_kl": average(ratio - 1.0 - log_ratio),
+            "policy_std": average(policy.stddev().mean(-1)),
+            "mean_part": average(mean_part),
+            "mean_part_max": most(mean_part),
+            "cov_part": average(cov_part),
+            "cov_part_max": most(cov_part),
+            "projected_fraction": average(is_outside.astype(jnp.float32)),
         }
         loss = policy_loss + regression_loss + self.value_coefficient * value_loss - self.entropy_coefficient * bonus
         return loss, jax.lax.stop_gradient(metrics)
