@@ -45,6 +45,16 @@ def test_the_thesis_setting_has_the_thesis_arithmetic():
     assert experiment.task.relative_velocity == "thesis"
 
 
+def test_trust_region_layers_are_configured_by_words():
+    words = ["learner=trl", "learner.projection=kl", "learner.mean_bound=0.05", "learner.coefficient=8"]
+    experiment = configs.build(configs.compose([*words, "network.std=state"]))
+    learner = experiment.learner
+    assert (learner.projection, learner.mean_bound, learner.cov_bound, learner.coefficient) == ("kl", 0.05, 1e-3, 8.0)
+    assert experiment.network.std == "state"
+    experiment = configs.build(configs.compose(["experiment=rendezvous_thesis", "learner=trl_thesis"]))
+    assert (experiment.learner.objective, experiment.learner.projection) == ("raw", "wasserstein")
+
+
 def test_words_win_over_an_experiment():
     config = configs.compose(["experiment=rendezvous_thesis", "learner=ppo", "num_worlds=16", "total_agent_steps=5"])
     assert config["learner"]["minibatch"] == "worlds"
@@ -86,6 +96,8 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("num_worlds=true", ["True", "an integer"]),
         ("total_agent_steps=1e6", ["an integer", "write 1000000"]),
         ("task.torus=1", ["task.torus", "true, false"]),
+        ("learner=trl_thesi", ["did you mean 'trl_thesis'", "ppo_thesis"]),
+        ("network.std=none", ["'none'", "shared, state"]),
         ("network.activation=gelu", ["'gelu'", "leaky_relu, relu, tanh"]),
         ("network.encoder=64", ["64", "a list of integers"]),
         ("network.encoder=[a]", ["network.encoder[0]", "an integer"]),
