@@ -62,7 +62,7 @@ def _project_and_pull_back(name, mean, std, old_mean, old_std, mean_bound, cov_b
 
 
 def recorded_inputs(meta, recorded, dtype):
-    """Arguments of `project`, one row a policy, with further dimensions in which nothing changes: one program for all."""
+    """Arguments of `project`, one row a policy; in further dimensions nothing changes, so one program does for all."""
 
     def padded(name, neutral):
         x = np.broadcast_to(recorded[name], (NUM_ROWS, meta["dim"]))
@@ -222,7 +222,8 @@ def test_gradients_are_finite_differences(name):
 
     with jax.enable_x64(True):
         (_, derivative), (above, _), (below, _) = (jax.tree.map(np.asarray, along(x)) for x in (0.0, step, -step))
-    is_clear = [abs(part / bound - 1) > 1e-3 for part, bound in zip(parts(name, mean, std, old_mean, old_std), bounds)]
+    distances = parts(name, mean, std, old_mean, old_std)
+    is_clear = [abs(part / bound - 1) > 1e-3 for part, bound in zip(distances, bounds, strict=True)]
     for d, a, b, rows in zip(derivative, above, below, is_clear, strict=True):
         np.testing.assert_allclose(d[rows], (a - b)[rows] / (2 * step), atol=1e-7)
 

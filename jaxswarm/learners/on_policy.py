@@ -4,9 +4,10 @@ Every agent's step is a sample of its own, with the common reward and that agent
 [steps, worlds, agents] in this order.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +62,9 @@ class LearnerState:
     optimizer_state: optax.OptState
 
 
+State = TypeVar("State", bound=LearnerState)
+
+
 @pytree
 class Batch:
     """Samples to learn from, one row each."""
@@ -99,8 +103,8 @@ def adam(learner: OnPolicy) -> optax.GradientTransformation:
 
 
 def update(
-    learner: OnPolicy, loss: Loss, key: Key, state: LearnerState, network: Any, task: Any, trajectory: Trajectory
-) -> tuple[LearnerState, Metrics]:
+    learner: OnPolicy, loss: Loss, key: Key, state: State, network: Any, task: Any, trajectory: Trajectory
+) -> tuple[State, Metrics]:
     """Descends `loss` on the samples of one trajectory, all epochs."""
     value, next_value = trajectory_values(network, state.params, task, trajectory)
     is_done = trajectory.terminated | trajectory.truncated
@@ -227,11 +231,11 @@ def descend(
     loss: Loss,
     fetch: Callable[[Int[Array, " units"]], Batch],
     optimizer: optax.GradientTransformation,
-    state: LearnerState,
+    state: State,
     num_units: int,
     num_minibatches: int,
     num_epochs: int,
-) -> tuple[LearnerState, Metrics]:
+) -> tuple[State, Metrics]:
     """Minibatch gradient descent; each epoch goes through all units once, in a fresh random order.
 
     The metrics are means over all minibatches; those called `..._max` are maxima.
@@ -240,14 +244,14 @@ def descend(
     def over(metrics: Metrics) -> Metrics:
         return {name: (jnp.max if name.endswith("_max") else jnp.mean)(x) for name, x in metrics.items()}
 
-    def minibatch(state: LearnerState, units: Int[Array, " units"]) -> tuple[LearnerState, Metrics]:
+    def minibatch(state: State, units: Int[Array, " units"]) -> tuple[State, Metrics]:
         gradient, metrics = jax.grad(loss, has_aux=True)(state.params, fetch(units))
         updates, optimizer_state = optimizer.update(gradient, state.optimizer_state, state.params)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         params = optax.apply_updates(state.params, updates)
-        return state.replace(params=params, optimizer_state=optimizer_state), metrics
+        return dataclasses.replace(state, params=params, optimizer_state=optimizer_state), metrics
 
-    def epoch(state: LearnerState, key: Key) -> tuple[LearnerState, Metrics]:
+    def epoch(state: State, key: Key) -> tuple[State, Metrics]:
         order = shuffled(key, num_minibatches, num_units // num_minibatches)
         state, metrics = jax.lax.scan(minibatch, state, order)
         return state, over(metrics)
