@@ -142,14 +142,14 @@ def combinations(words: Sequence[str]) -> list[list[tuple[str, Any]]]:
 
 
 def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
-    """The config with other values at dotted keys, checked. A given length replaces the other way to say it."""
+    """The config with other values at these keys, checked. A given length replaces the other way to say it."""
     config = {key: dict(value) if isinstance(value, dict) else value for key, value in config.items()}
     pairs = list(pairs)
     lengths = {key for key, _ in pairs} & set(LENGTHS)
     if len(lengths) == 1:
         config |= dict.fromkeys(set(LENGTHS) - lengths)
     for key, value in pairs:
-        head, _, tail = key.partition(".")
+        head, _, tail = _full_key(key, config).partition(".")
         if not tail:
             if isinstance(config.get(key), dict):
                 raise ConfigError(f"{key} = {value!r} is not possible; accepted: {key}.<field>=value")
@@ -159,6 +159,17 @@ def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
         else:
             raise _unknown(key, "", config)
     return validate(config)
+
+
+def _full_key(key: str, config: Config) -> str:
+    """A field's name stands for `part.name` where only one part has it."""
+    if "." in key or key in config or key in _top_fields():
+        return key
+    owners = [part for part in PARTS if key in _fields(part, config[part])]
+    if len(owners) > 1:
+        choice = " or ".join(f"{part}.{key}" for part in owners)
+        raise ConfigError(f"{key} is a field of {' and '.join(owners)}; accepted: {choice}")
+    return f"{owners[0]}.{key}" if owners else key
 
 
 def validate(config: Config) -> Config:

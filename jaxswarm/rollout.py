@@ -29,6 +29,7 @@ class Trajectory:
     terminated: Bool[Array, "steps worlds"]
     truncated: Bool[Array, "steps worlds"]
     final_state: Any
+    mask: Bool[Array, "steps worlds agents"] | None  # agents that exist; None: all do
 
 
 @pytree
@@ -67,7 +68,8 @@ def collect(
     def step(carry: tuple, key: Key) -> tuple:
         worlds, num_resets, totals = carry
         action_key, world_key = jax.random.split(key)
-        distribution = policy(jax.vmap(task.observe)(worlds.state))
+        obs = jax.vmap(task.observe)(worlds.state)
+        distribution = policy(obs)
         action = distribution.sample(seed=action_key)
         final_state, outcome = _step_worlds(world_key, task, worlds.state, action)
         transition = Trajectory(
@@ -80,6 +82,7 @@ def collect(
             outcome.terminated,
             outcome.truncated,
             final_state,
+            obs.mask,
         )
         is_done = outcome.terminated | outcome.truncated
         episode_return = worlds.episode_return + outcome.reward

@@ -101,3 +101,16 @@ def test_equal_networks_are_equal_as_compilation_keys():
     assert one == two
     assert hash(one) == hash(two)
     assert one != ActorCritic(aggregator=AGGREGATORS["bayesian"]())
+
+
+def test_a_standard_deviation_of_the_state_starts_near_1_and_differs_between_states():
+    model = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"](), std="state")
+    obs = rendezvous_like(num_rows=6)
+    tree = model.init(jax.random.key(0), obs)
+    assert "log_std" not in tree["params"]
+    std = np.asarray(model.apply(tree, obs, method="policy").stddev())
+    assert std.shape == (6, 2)
+    assert 0 < np.abs(std - 1).max() < 0.1
+    assert (std.std(0) > 0).all()
+    shared = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"]())
+    assert (np.asarray(shared.apply(shared.init(jax.random.key(0), obs), obs, method="policy").stddev()) == 1).all()

@@ -59,8 +59,10 @@ def test_every_sample_is_as_likely_in_every_minibatch(rows, columns):
     assert np.abs(together - (columns - 1) / (rows * columns - 1)).max() < 5 / np.sqrt(rows * num_draws)
 
 
-def random_trajectory(task, num_steps=6, num_worlds=3):
-    network = ActorCritic((4,), (4,), aggregator=AGGREGATORS["mean"](), action_dim=task.action_dim)
+def random_trajectory(task, num_steps=6, num_worlds=3, std="shared"):
+    network = ActorCritic(
+        encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["mean"](), std=std, action_dim=task.action_dim
+    )
     params = network.init(jax.random.key(0), task.observe(task.reset(jax.random.key(0))))
     worlds = rollout.start(jax.random.key(1), task, num_worlds, is_desynchronised=False)
     policy = lambda obs: network.apply(params, obs, method="policy")  # noqa: E731
@@ -71,8 +73,7 @@ def random_trajectory(task, num_steps=6, num_worlds=3):
 def test_values_after_a_step_are_those_of_the_state_before_any_reset():
     task = PROBES["delayed reward"]
     network, params, trajectory, _ = random_trajectory(task)
-    values, next_values, mask = on_policy.trajectory_values(network, params, task, trajectory)
-    assert mask is None
+    values, next_values = on_policy.trajectory_values(network, params, task, trajectory)
     observe = jax.vmap(jax.vmap(task.observe))
     expected = network.apply(params, observe(trajectory.state), method="value")
     np.testing.assert_allclose(values, expected, atol=1e-6)
@@ -96,10 +97,10 @@ def test_fetched_samples_are_those_of_the_trajectory():
     np.testing.assert_allclose(batch.obs.groups["neighbors"].features[1, 0], obs.own[2, 1, 0])
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_agents_that_do_not_exist_have_no_influence_on_an_update(name):
+@pytest.mark.parametrize(("name", "std"), [*((name, "shared") for name in LEARNERS), ("trl", "state")])
+def test_agents_that_do_not_exist_have_no_influence_on_an_update(name, std):
     task = TASKS["rendezvous"](num_agents=4, active_agents=(2, 3), episode_length=4)
-    network, params, trajectory, _ = random_trajectory(task)
+    network, params, trajectory, _ = random_trajectory(task, std=std)
     learner = LEARNERS[name](batch_size=36, num_epochs=1)
     is_absent = jnp.arange(4)[None, None] >= trajectory.state.active_agents[..., None]
     assert is_absent.any()

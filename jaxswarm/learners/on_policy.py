@@ -4,9 +4,10 @@ Every agent's step is a sample of its own, with the common reward and that agent
 [steps, worlds, agents] in this order. Those of agents that did not exist have no influence on any loss.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -79,6 +80,9 @@ class LearnerState:
     optimizer_state: optax.OptState
 
 
+State = TypeVar("State", bound=LearnerState)
+
+
 @pytree
 class Batch:
     """Samples to learn from, one row each."""
@@ -117,10 +121,10 @@ def adam(learner: OnPolicy) -> optax.GradientTransformation:
 
 
 def update(
-    learner: OnPolicy, loss: Loss, key: Key, state: LearnerState, network: Any, task: Any, trajectory: Trajectory
-) -> tuple[LearnerState, Metrics]:
+    learner: OnPolicy, loss: Loss, key: Key, state: State, network: Any, task: Any, trajectory: Trajectory
+) -> tuple[State, Metrics]:
     """Descends `loss` on the samples of one trajectory, all epochs."""
-    value, next_value, existing = trajectory_values(network, state.params, task, trajectory)
+    value, next_value = trajectory_values(network, state.params, task, trajectory)
     is_done = trajectory.terminated | trajectory.truncated
     is_terminal = trajectory.terminated if learner.bootstrap_truncation else is_done
     advantage = generalized_advantages(
@@ -139,27 +143,26 @@ def update(
         num_samples // batch_size(learner, num_samples, task.num_agents),
         learner.num_epochs,
     )
-    return state, metrics | {"explained_variance": explained_variance(value, target, existing)}
+    return state, metrics | {"explained_variance": explained_variance(value, target, trajectory.mask)}
 
 
 def trajectory_values(
     network: Any, params: Params, task: Any, trajectory: Trajectory
-) -> tuple[Float[Array, "steps worlds agents"], Float[Array, "steps worlds agents"], Mask]:
-    """Values of the state before each step and of the state after it, before any reset; and which agents exist."""
+) -> tuple[Float[Array, "steps worlds agents"], Float[Array, "steps worlds agents"]]:
+    """Values of the state before each step, and of the state after it, before any reset."""
 
-    def value_and_mask(state: Any) -> tuple[Array, Array | None]:
-        obs = jax.vmap(task.observe)(state)
-        return network.apply(params, obs, method="value"), obs.mask
+    def value(state: Any) -> Array:
+        return network.apply(params, jax.vmap(task.observe)(state), method="value")
 
     def value_after(step: tuple) -> Array:
         """Where no episode ended, the state after this step is the one before the next; the last step has no next."""
         is_known, final_state, following = step
-        return jax.lax.cond(is_known, lambda: following, lambda: value_and_mask(final_state)[0])
+        return jax.lax.cond(is_known, lambda: following, lambda: value(final_state))
 
-    values, mask = jax.lax.map(value_and_mask, trajectory.state)
+    values = jax.lax.map(value, trajectory.state)
     is_known = ~(trajectory.terminated | trajectory.truncated).any(-1)
     is_known = is_known.at[-1].set(False)
-    return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0))), mask
+    return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0)))
 
 
 def generalized_advantages(
@@ -246,11 +249,11 @@ def descend(
     loss: Loss,
     fetch: Callable[[Int[Array, " units"]], Batch],
     optimizer: optax.GradientTransformation,
-    state: LearnerState,
+    state: State,
     num_units: int,
     num_minibatches: int,
     num_epochs: int,
-) -> tuple[LearnerState, Metrics]:
+) -> tuple[State, Metrics]:
     """Minibatch gradient descent; each epoch goes through all units once, in a fresh random order.
 
     The metrics are means over all minibatches; those called `..._max` are maxima.
@@ -259,14 +262,14 @@ def descend(
     def over(metrics: Metrics) -> Metrics:
         return {name: (jnp.max if name.endswith("_max") else jnp.mean)(x) for name, x in metrics.items()}
 
-    def minibatch(state: LearnerState, units: Int[Array, " units"]) -> tuple[LearnerState, Metrics]:
+    def minibatch(state: State, units: Int[Array, " units"]) -> tuple[State, Metrics]:
         gradient, metrics = jax.grad(loss, has_aux=True)(state.params, fetch(units))
         updates, optimizer_state = optimizer.update(gradient, state.optimizer_state, state.params)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         params = optax.apply_updates(state.params, updates)
-        return state.replace(params=params, optimizer_state=optimizer_state), metrics
+        return dataclasses.replace(state, params=params, optimizer_state=optimizer_state), metrics
 
-    def epoch(state: LearnerState, key: Key) -> tuple[LearnerState, Metrics]:
+    def epoch(state: State, key: Key) -> tuple[State, Metrics]:
         order = shuffled(key, num_minibatches, num_units // num_minibatches)
         state, metrics = jax.lax.scan(minibatch, state, order)
         return state, over(metrics)

@@ -1,8 +1,8 @@
 """Trust region projections of diagonal Gaussians (Otto et al., "Differentiable Trust Region Layers", 2021).
 
 A projection replaces a policy by the nearest one whose mean and standard deviation are each within a bound of the old
-policy's. Every row is projected by itself, and rows within a bound come back bit by bit. All is elementwise formulas and
-sums over the action's dimensions, to be compiled, batched and differentiated; old policy and bounds are constants.
+policy's. Every row is projected by itself, and rows within a bound come back bit by bit. All is elementwise formulas
+and sums over the action's dimensions, to be compiled, batched and differentiated; old policy and bounds are constants.
 
 Bounds of different kinds are different sizes: near the old policy, a bound of 0.03 lets the mean move by 0.24 old
 standard deviations with `kl`, by 0.17 with the others. The covariance's parts of `kl` and `wasserstein` are equal near
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxswarm.distributions import Policy, gaussian_with_std
+from jaxswarm.distributions import Policy, gaussian_with_std, mean_and_std
 
 NUM_STEPS = 5  # of the root finding of `kl`: 2 suffice for bounds up to 0.01, 4 up to 1
 
@@ -38,11 +38,12 @@ class Projection:
 
     def __call__(self, policy: Policy, old_policy: Policy, mean_bound: Bound, cov_bound: Bound) -> Policy:
         """The policy within the bounds that is nearest to `policy`."""
-        old_mean, old_std, mean_bound, cov_bound = jax.lax.stop_gradient(
-            (old_policy.mean(), old_policy.stddev(), mean_bound, cov_bound)
+        mean, std = mean_and_std(policy)
+        (old_mean, old_std), mean_bound, cov_bound = jax.lax.stop_gradient(
+            (mean_and_std(old_policy), mean_bound, cov_bound)
         )
-        mean = self.project_mean(policy.mean(), old_mean, old_std, mean_bound)
-        return gaussian_with_std(mean, self.project_std(policy.stddev(), old_std, cov_bound))
+        mean = self.project_mean(mean, old_mean, old_std, mean_bound)
+        return gaussian_with_std(mean, self.project_std(std, old_std, cov_bound))
 
     def project_mean(
         self,
@@ -150,8 +151,8 @@ def project_std_kl(
     Where it is outside, precisions are averaged: 1 / projected^2 = s / std^2 + (1 - s) / old_std^2, with s in (0, 1)
     such that the divergence is the bound. For bounds up to 2, s is exact to nine digits or to rounding.
 
-    The derivative is that of the implicit function, for `std` alone. In logarithms it is (I - t t' / t't) diag(w), where
-    t = 1 - (projected / old_std)^2 is normal to the ball and w = s (projected / std)^2.
+    The derivative is that of the implicit function, for `std` alone. In logarithms it is (I - t t' / t't) diag(w),
+    where t = 1 - (projected / old_std)^2 is normal to the ball and w = s (projected / std)^2.
     """
     return _solve_kl(std, old_std, bound)[0]
 
@@ -180,10 +181,10 @@ def _solve_kl(
 def _root(a: Float[Array, "dim *batch"], bound: Bound, is_near_one: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The s in (0, 1] where h(s) = half the sum of log1p(s a) - s a / (1 + s a) is the bound; a > -1.
 
-    h grows with s from h(0) = 0. Newton's steps for ln h as a function of y = ln s, corrected for its curvature (Halley),
+    h grows with s from h(0) = 0. Newton's steps for ln h as a function of y = ln s, corrected for curvature (Halley),
     in a bracket; a step that leaves the bracket becomes a bisection. A root near the bracket's upper end is approached
-    from there, as steps beyond it would never end. With u = s a and t = u / (1 + u), two derivatives are almost free:
-    dh / dy = sum t^2 / 2, whose derivative is sum t^2 (1 - t).
+    from there, because steps from below would leave the bracket for ever. With u = s a and t = u / (1 + u), two
+    derivatives are almost free: dh / dy = sum t^2 / 2, whose derivative is sum t^2 (1 - t).
 
     Dimensions come first, and the steps are a loop: three to five times as fast on a CPU as the opposites.
     """
