@@ -31,8 +31,9 @@ Summary = Any  # a pytree of arrays [receivers, ...]
 Layout = Literal["streaming", "dense", "segments"]
 
 LOWEST = float(np.finfo(np.float32).min)  # the identity of max; finite, so that differences are numbers
+_FASTEST: dict[str, Layout] = {"add": "streaming", "max": "dense", "scaled_add": "segments"}  # by reduction
 _UNROLL = 10  # slots per loop iteration of the streaming layout
-_PIECE = {"streaming": 2**16, "dense": 2**19, "segments": 2**19}  # numbers that one array of activations may have
+_PIECE = {"streaming": 2**16, "dense": 2**18, "segments": 2**18}  # numbers in one array of activations
 
 
 @pytree
@@ -53,7 +54,7 @@ class Segments:
 
 @pytree
 class DenseView:
-    """Whole groups side by side; the messages of absent entities are 0."""
+    """Whole groups side by side; the messages of absent entities are arbitrary numbers of moderate size."""
 
     messages: Float[Array, "receivers slots features"]
     mask: Bool[Array, "receivers slots"]
@@ -97,14 +98,14 @@ def _constant(value: float) -> Callable[[Summary], Summary]:
 
 def _combine_scaled(one: Summary, two: Summary) -> Summary:
     (exponent, values), (other_exponent, other_values) = one, two
-    top = jnp.maximum(exponent, other_exponent)
+    top = jax.lax.stop_gradient(jnp.maximum(exponent, other_exponent))  # any number gives the same exp(m) values
     scale, other_scale = jnp.exp(exponent - top), jnp.exp(other_exponent - top)
     return top, jax.tree.map(lambda x, y: x * scale + y * other_scale, values, other_values)
 
 
 def _reduce_scaled(summary: Summary, over: Over) -> Summary:
     exponent, values = summary
-    top = over.max(exponent)
+    top = jax.lax.stop_gradient(over.max(exponent))
     scale = jnp.exp(exponent - over.spread(top))
     return top, jax.tree.map(lambda x: over.add(x * scale), values)
 
@@ -140,7 +141,7 @@ def counts(segments: Segments) -> Bool[Array, " messages"]:
 
 
 def aggregate(
-    aggregator: Any, /, messages: Float[Array, "messages features"], segments: Segments
+    aggregator: Any, messages: Float[Array, "messages features"], segments: Segments
 ) -> Float[Array, "receivers out"]:
     """Aggregates a list of messages by receiver; a message is the concatenation of its parts."""
     is_present = counts(segments)
@@ -153,7 +154,6 @@ def aggregate(
 
 def aggregate_dense(aggregator: Any, view: DenseView) -> Float[Array, "receivers out"]:
     """Aggregates the messages of a dense view."""
-    view = view.replace(messages=jnp.where(view.mask[..., None], view.messages, 0.0))  # pyright: ignore
     if not isinstance(aggregator, Monoid):
         return aggregator.pool(view)
     messages = view.messages.reshape(-1, view.messages.shape[-1])
@@ -218,7 +218,8 @@ class Pool(nn.Module):
         self, groups: tuple[Entities, ...], own: Float[Array, "receivers own_dim"] | None = None
     ) -> Float[Array, "receivers out"]:
         """Vectors of the receivers of groups with features [receivers, slots, dim]; `own` is what they know."""
-        layout: Layout = self.layout or ("streaming" if isinstance(self.aggregator, Monoid) else "dense")
+        is_monoid = isinstance(self.aggregator, Monoid)
+        layout = self.layout or (_FASTEST[self.aggregator.reduction] if is_monoid else "dense")
         num_receivers = groups[0].mask.shape[0]
         groups = tuple(Entities(jnp.where(x.mask[..., None], x.features, 0.0), x.mask) for x in groups)
         num_pieces = max(-(-num_receivers // self._piece_size(layout, groups)), 1)

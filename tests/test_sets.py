@@ -62,7 +62,7 @@ def assert_close(one, two):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=2e-5, rtol=1e-4), one, two)
 
 
-@pytest.mark.parametrize("layout", ["dense", "segments"])
+@pytest.mark.parametrize("layout", ["streaming", "dense", "segments"])
 @pytest.mark.parametrize("name", MONOIDS)
 def test_layouts_agree(name, layout):
     other = jax.jit(Groups(AGGREGATOR[name], layout).apply)
@@ -70,16 +70,21 @@ def test_layouts_agree(name, layout):
         assert_close(other(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed))[0][1])
 
 
+@pytest.mark.parametrize("layout", ["streaming", "dense", "segments"])
 @pytest.mark.parametrize("name", EACH_REDUCTION)
-def test_layouts_agree_in_their_gradients(name):
-    dense = output_and_gradient(name, "dense")
+def test_layouts_agree_in_their_gradients(name, layout):
+    other = output_and_gradient(name, layout)
     for seed in range(10):
-        assert_close(dense(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed)))
+        assert_close(other(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed)))
 
 
 @pytest.mark.parametrize("name", ["bayesian", "attentive, query"])
 def test_pieces_agree_with_the_whole(name, monkeypatch):
-    monkeypatch.setattr(sets, "_PIECE", {"streaming": 2 * 2 * WIDTH, "dense": 2 * sum(SLOTS) * WIDTH})
+    monkeypatch.setattr(
+        sets,
+        "_PIECE",
+        {"streaming": 2 * 2 * WIDTH, "dense": 2 * sum(SLOTS) * WIDTH, "segments": 2 * sum(SLOTS) * WIDTH},
+    )
     pieces = output_and_gradient(name)
     for seed in range(5):
         assert_close(pieces(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed)))
