@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxswarm.distributions import Policy, gaussian_with_std, mean_and_std
 
-NUM_STEPS = 5  # of the root finding of `kl`: 2 suffice for bounds up to 0.01, 4 up to 1
+NUM_STEPS = 5  # of the root finding of `kl`: 2 suffice for bounds up to 0.05, 4 up to 1
 
 Bound = Float[Array, ""] | float
 
