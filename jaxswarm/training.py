@@ -63,6 +63,7 @@ class TrainState:
     worlds: Worlds
 
 
+@jax.jit
 def init(experiment: Experiment, key: Key) -> TrainState:
     """State before the first update."""
     run_key, params_key, obs_key, worlds_key = jax.random.split(key, 4)

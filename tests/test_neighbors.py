@@ -41,7 +41,7 @@ def random_swarm(seed):
 
 
 @pytest.mark.parametrize("torus", [False, True])
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31))
 def test_cells_give_what_all_pairs_give(torus, seed):
     position, num_present, radius = random_swarm(seed)
@@ -59,7 +59,7 @@ def test_cells_give_what_all_pairs_give(torus, seed):
 
 
 @pytest.mark.parametrize("torus", [False, True])
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**31))
 def test_with_too_little_room_the_nearest_are_kept_and_all_are_counted(torus, seed):
     position, _, radius = random_swarm(seed)

@@ -150,7 +150,7 @@ def test_separate_encoders_of_the_same_weights_are_a_shared_one():
 @pytest.mark.parametrize("variance_encoder", ["shared", "separate"])
 def test_a_second_stage_is_further_layers_that_all_groups_share(variance_encoder):
     options = {"decoder": (5,), "aggregator": AGGREGATORS["bayesian"](variance_encoder=variance_encoder)}
-    one_stage, two_stages = ActorCritic((6, 4), **options), ActorCritic((6,), (4,), **options)
+    one_stage, two_stages = ActorCritic((6, 4), **options), ActorCritic((6,), shared_encoder=(4,), **options)
     obs = pursuit_like(num_rows=4)
     tree = jax.jit(two_stages.init)(jax.random.key(0), obs)["params"]
 
@@ -211,11 +211,13 @@ def test_equal_networks_are_equal_as_compilation_keys():
 def test_a_standard_deviation_of_the_state_starts_near_1_and_differs_between_states():
     model = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"](), std="state")
     obs = rendezvous_like(num_rows=6)
-    tree = model.init(jax.random.key(0), obs)
+    tree = jax.jit(model.init)(jax.random.key(0), obs)
     assert "log_std" not in tree["params"]
     std = np.asarray(model.apply(tree, obs, method="policy").stddev())
     assert std.shape == (6, 2)
     assert 0 < np.abs(std - 1).max() < 0.1
     assert (std.std(0) > 0).all()
     shared = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"]())
-    assert (np.asarray(shared.apply(shared.init(jax.random.key(0), obs), obs, method="policy").stddev()) == 1).all()
+    assert (
+        np.asarray(shared.apply(jax.jit(shared.init)(jax.random.key(0), obs), obs, method="policy").stddev()) == 1
+    ).all()

@@ -1,8 +1,16 @@
-"""Every learner finds the known values and best actions of the probe tasks."""
+"""Every learner finds the known values and best actions of the probe tasks; trust regions bound its updates."""
+
+from functools import partial
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
-from probes import CASES, OPTIONS, look, train_probes
+from probes import CASES, OPTIONS, PROBES, look, train_probes
+from test_projections import cov_distance, mean_distance
+
+from jaxswarm import LEARNERS
+from jaxswarm.learners.projections import PROJECTIONS
 
 
 @pytest.fixture(scope="module", params=CASES, ids=["-".join(filter(None, case)) for case in CASES])
@@ -42,3 +50,27 @@ def test_best_action(outputs):
 @pytest.mark.parametrize("cue", [-1, 1])
 def test_best_action_that_depends_on_the_observation(outputs, cue):
     assert outputs("reward that depends on both", cue, 0)[0] == pytest.approx(cue / 2, abs=0.15)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+@partial(jax.vmap, in_axes=(0, None, None))
+def mean_and_std(params, cue, time):
+    policy, _ = look(params, cue, time)
+    return policy.mean(), policy.stddev()
+
+
+@pytest.mark.parametrize("probe", PROBES)
+@pytest.mark.parametrize("name", PROJECTIONS)
+def test_successive_policies_are_within_the_bounds(name, probe):
+    """The standard deviation exactly; the mean, which is only drawn back, on average at most twice as far."""
+    params, _ = train_probes("trl", name)[probe]
+    mean_bound, cov_bound = LEARNERS["trl"]().mean_bound, LEARNERS["trl"]().cov_bound
+    states = jnp.array([-1, -1, 1, 1]), jnp.array([0, 1, 0, 1])
+    mean, std = (np.asarray(x, np.float64) for x in mean_and_std(params, *states))
+    (mean, old_mean), (std, old_std) = ((x[:, 1:], x[:, :-1]) for x in (mean, std))
+    assert cov_distance(name, std, old_std).max() <= cov_bound * 1.001
+    assert mean_distance(name, mean, old_mean, old_std).mean(0).max() <= mean_bound * 2
+    if name in ("kl", "wasserstein"):  # whose bounds are bounds of the divergence, whatever the scale
+        divergence = mean_distance("kl", mean, old_mean, old_std) + cov_distance("kl", std, old_std)
+        assert divergence.mean(0).max() <= mean_bound * 2 + cov_bound * 1.1

@@ -52,8 +52,7 @@ def assert_same_outcome(outcome, other):
         np.testing.assert_allclose(metric, other.metrics[name], rtol=1e-4)
 
 
-@every_swarm
-@pytest.mark.parametrize("max_neighbors", [None, ROOM])
+@pytest.mark.parametrize(("name", "max_neighbors"), [("rendezvous", ROOM), ("pursuit", None)])
 def test_a_swarm_with_absent_agents_is_a_smaller_swarm(name, max_neighbors):
     large = crowded(name, active_agents=(2, ROOM), max_neighbors=max_neighbors)
     small = TASKS[name](num_agents=PRESENT)
@@ -71,8 +70,7 @@ def test_a_swarm_with_absent_agents_is_a_smaller_swarm(name, max_neighbors):
     assert expected_obs.mask is None
 
 
-@every_swarm
-@pytest.mark.parametrize("max_neighbors", [None, 3])
+@pytest.mark.parametrize(("name", "max_neighbors"), [("rendezvous", None), ("pursuit", 3)])
 def test_absent_agents_have_no_influence(name, max_neighbors):
     task = crowded(name, active_agents=(2, ROOM), max_neighbors=max_neighbors)
     state, action = with_absent(task, PRESENT), jnp.zeros((ROOM, 2))
@@ -86,8 +84,7 @@ def test_absent_agents_have_no_influence(name, max_neighbors):
     jax.tree.map(np.testing.assert_array_equal, *present)
 
 
-@every_swarm
-@pytest.mark.parametrize("torus", [False, True])
+@pytest.mark.parametrize(("name", "torus"), [("rendezvous", True), ("pursuit", False)])
 @pytest.mark.parametrize("radius", [15.0, 40.0, 200.0])
 def test_lists_of_all_neighbours_change_nothing(name, torus, radius):
     dense = crowded(name, torus=torus, visibility_radius=radius)

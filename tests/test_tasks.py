@@ -14,8 +14,7 @@ NUM_AGENTS, EPISODE_LENGTH, NUM_WORLDS = 4, 6, 3
 KEY = jax.random.key(1)
 VARIANTS = {
     "as they are": {},
-    "numbers vary": {"active_agents": (2, NUM_AGENTS - 1)},
-    "nearest only": {"max_neighbors": 2, "visibility_radius": 60.0},
+    "numbers vary, nearest only": {"active_agents": (2, 3), "max_neighbors": 2, "visibility_radius": 60.0},
 }
 
 
