@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 import jaxswarm
 from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
@@ -76,7 +77,11 @@ OPTIONS = {"num_epochs": 8, "batch_size": 64, "learning_rate": 3e-3, "discount":
 SIZES = {"num_worlds": 64, "num_steps": 2, "eval_worlds": 8, "eval_every": 20}
 NUM_UPDATES = 40
 NETWORK = ActorCritic(encoder=(8,), decoder=(16,), aggregator=AGGREGATORS["mean"](), action_dim=1)
-CASES = [(name, projection) for name in LEARNERS for projection in (PROJECTIONS if name == "trl" else [None])]
+CASES = [
+    pytest.param((name, projection), marks=pytest.mark.slow if projection else (), id=f"{name}-{projection}")
+    for name in LEARNERS
+    for projection in (PROJECTIONS if name == "trl" else [None])
+]
 
 
 @pytree

@@ -2,6 +2,8 @@
 
 import itertools
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,15 +36,13 @@ def segments(mask):
     return segments_of(jnp.asarray(mask)).replace(own=jnp.asarray(OWN_FEATURES))
 
 
-def random_params(name):
+@functools.cache
+def params_of(name):
     """Of no special values, as after some training."""
     rng = np.random.default_rng(3)
     messages, full = jnp.zeros((RECEIVERS * SLOTS, LENGTH[name])), segments(np.ones((RECEIVERS, SLOTS), bool))
-    params = MODELS[name].init(jax.random.key(0), messages, full)
+    params = jax.jit(MODELS[name].init)(jax.random.key(0), messages, full)
     return jax.tree.map(lambda x: x + jnp.asarray(0.5 * rng.normal(size=x.shape), jnp.float32), params)
-
-
-PARAMS = {name: random_params(name) for name in MODELS}
 
 
 def output_and_gradients(model):
@@ -157,9 +157,9 @@ def test_groups_of_any_size_give_what_the_formula_says(name, seed):
     messages, mask, _ = random_messages(name, seed)
     if name == "rbf":
         messages[..., 1:3] /= np.linalg.norm(messages[..., 1:3], axis=-1, keepdims=True)
-    _, result = EVALUATE[name](PARAMS[name], flat(messages), segments(mask))
+    _, result = EVALUATE[name](params_of(name), flat(messages), segments(mask))
     assert result.dtype == jnp.float32
-    params = jax.tree.map(np.float64, PARAMS[name].get("params", {}))
+    params = jax.tree.map(np.float64, params_of(name).get("params", {}))
     formula = FORMULAS[name.partition(",")[0]]
     for row, group, present, own in zip(result, np.float64(messages), mask, OWN_FEATURES, strict=True):
         np.testing.assert_allclose(row, formula(group[present], MODELS[name], params, own), atol=1e-5, rtol=1e-4)
@@ -172,8 +172,8 @@ def test_absent_entities_have_no_influence(name, seed, scale):
     messages, mask, rng = random_messages(name, seed)
     noise = np.clip(rng.normal(size=messages.shape), -3, 3).astype(np.float32) * np.float32(scale)
     other = np.where(mask[..., None], messages, noise)
-    one = EVALUATE[name](PARAMS[name], flat(messages), segments(mask))
-    two = EVALUATE[name](PARAMS[name], flat(other), segments(mask))
+    one = EVALUATE[name](params_of(name), flat(messages), segments(mask))
+    two = EVALUATE[name](params_of(name), flat(other), segments(mask))
     jax.tree.map(np.testing.assert_array_equal, one, two)
     (_, gradient), _ = one
     np.testing.assert_array_equal(gradient[~mask.reshape(-1)], 0.0)
@@ -188,8 +188,8 @@ def test_order_has_no_influence(name, seed):
     order = rng.permutation(RECEIVERS * SLOTS)  # also across receivers
     regular = segments(mask)
     shuffled = regular.replace(receiver=regular.receiver[order], is_present=regular.is_present[order])
-    (_, one_gradient), one = EVALUATE[name](PARAMS[name], flat(messages), regular)
-    (_, two_gradient), two = EVALUATE[name](PARAMS[name], flat(messages)[order], shuffled)
+    (_, one_gradient), one = EVALUATE[name](params_of(name), flat(messages), regular)
+    (_, two_gradient), two = EVALUATE[name](params_of(name), flat(messages)[order], shuffled)
     np.testing.assert_allclose(two, one, atol=2e-6, rtol=1e-5)
     np.testing.assert_allclose(two_gradient, one_gradient[order], atol=2e-5, rtol=1e-4)
 
@@ -201,7 +201,7 @@ def test_messages_to_receivers_that_do_not_exist_are_absent(name, nobody):
     regular = segments(mask)
     receiver = jnp.where(regular.is_present, regular.receiver, nobody)
     other = regular.replace(receiver=receiver, is_present=jnp.ones_like(regular.is_present))
-    one, two = (EVALUATE[name](PARAMS[name], flat(messages), x) for x in (regular, other))
+    one, two = (EVALUATE[name](params_of(name), flat(messages), x) for x in (regular, other))
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
@@ -210,9 +210,9 @@ def test_gradients_are_those_of_the_output(name):
     _, mask, rng = random_messages(name, 11)
     mask[0], mask[1, 0] = True, True
     messages, direction = rng.normal(size=(2, RECEIVERS * SLOTS, LENGTH[name]))
-    (_, gradient), _ = EVALUATE[name](PARAMS[name], flat(messages), segments(mask))
+    (_, gradient), _ = EVALUATE[name](params_of(name), flat(messages), segments(mask))
     outputs = [
-        np.float64(EVALUATE[name](PARAMS[name], flat(messages + step * direction), segments(mask))[1])
+        np.float64(EVALUATE[name](params_of(name), flat(messages + step * direction), segments(mask))[1])
         for step in (-1e-3, 1e-3)
     ]
     numeric = (np.square(outputs[1]).sum() - np.square(outputs[0]).sum()) / 2e-3
@@ -224,14 +224,14 @@ def test_gradients_are_those_of_the_output(name):
 def test_empty_groups_give_finite_output_and_gradient(name, num_slots):
     messages = jnp.ones((RECEIVERS * num_slots, LENGTH[name]))
     empty = segments(np.zeros((RECEIVERS, num_slots), bool))
-    for leaf in jax.tree.leaves(EVALUATE[name](PARAMS[name], messages, empty)):
+    for leaf in jax.tree.leaves(EVALUATE[name](params_of(name), messages, empty)):
         assert np.isfinite(leaf).all()
 
 
 @every_aggregator
 def test_no_receivers_give_no_vectors(name):
     none = segments_of(jnp.zeros((0, SLOTS), bool)).replace(own=jnp.zeros((0, OWN)))
-    assert MODELS[name].apply(PARAMS[name], jnp.zeros((0, LENGTH[name])), none).shape[0] == 0
+    assert MODELS[name].apply(params_of(name), jnp.zeros((0, LENGTH[name])), none).shape[0] == 0
 
 
 def test_softmax_of_large_messages_is_finite_and_exact():

@@ -30,8 +30,13 @@ def complete(meta):
     return meta | common | {"layout": layout}
 
 
-CASES = [(complete(meta), arrays) for meta, arrays in cases("ppo.npz")]
-by_case = pytest.mark.parametrize(("meta", "arrays"), CASES, ids=[meta["agg"] for meta, _ in CASES])
+by_case = pytest.mark.parametrize(
+    ("meta", "arrays"),
+    [
+        pytest.param(complete(meta), arrays, id=meta["agg"], marks=pytest.mark.slow if meta["agg"] == "max" else ())
+        for meta, arrays in cases("ppo.npz")
+    ],
+)
 
 
 def recorded_advantages(meta, arrays):

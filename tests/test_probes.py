@@ -13,7 +13,7 @@ from jaxswarm import LEARNERS
 from jaxswarm.learners.projections import PROJECTIONS
 
 
-@pytest.fixture(scope="module", params=CASES, ids=["-".join(filter(None, case)) for case in CASES])
+@pytest.fixture(scope="module", params=CASES)
 def outputs(request):
     """Action and value by (probe, cue, time) after training all probes side by side."""
     results = train_probes(*request.param)
@@ -60,6 +60,7 @@ def mean_and_std(params, cue, time):
     return policy.mean(), policy.stddev()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("probe", PROBES)
 @pytest.mark.parametrize("name", PROJECTIONS)
 def test_successive_policies_are_within_the_bounds(name, probe):

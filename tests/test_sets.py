@@ -1,5 +1,7 @@
 """However a group is laid out, and in however many pieces it is taken, an aggregator gives the same vector."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +56,11 @@ def output_and_gradient(name, layout=None):
     return jax.jit(jax.value_and_grad(loss, has_aux=True))
 
 
-PARAMS = {name: Groups(AGGREGATOR[name]).init(jax.random.key(1), *groups(0)) for name in AGGREGATOR}
+@functools.cache
+def params_of(name):
+    return jax.jit(Groups(AGGREGATOR[name]).init)(jax.random.key(1), *groups(0))
+
+
 CHOSEN = {name: output_and_gradient(name) for name in AGGREGATOR}
 
 
@@ -67,7 +73,7 @@ def assert_close(one, two):
 def test_layouts_agree(name, layout):
     other = jax.jit(Groups(AGGREGATOR[name], layout).apply)
     for seed in range(10):
-        assert_close(other(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed))[0][1])
+        assert_close(other(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed))[0][1])
 
 
 @pytest.mark.parametrize("layout", ["streaming", "dense", "segments"])
@@ -75,7 +81,7 @@ def test_layouts_agree(name, layout):
 def test_layouts_agree_in_their_gradients(name, layout):
     other = output_and_gradient(name, layout)
     for seed in range(10):
-        assert_close(other(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed)))
+        assert_close(other(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed)))
 
 
 @pytest.mark.parametrize("name", ["bayesian", "attentive, query"])
@@ -87,7 +93,7 @@ def test_pieces_agree_with_the_whole(name, monkeypatch):
     )
     pieces = output_and_gradient(name)
     for seed in range(5):
-        assert_close(pieces(PARAMS[name], *groups(seed)), CHOSEN[name](PARAMS[name], *groups(seed)))
+        assert_close(pieces(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed)))
 
 
 @pytest.mark.parametrize("name", AGGREGATOR)
@@ -99,7 +105,7 @@ def test_features_of_absent_entities_have_no_influence(name, scale):
     other = tuple(
         x.replace(features=jnp.where(x.mask[..., None], x.features, noise[:, : x.mask.shape[1]])) for x in pair
     )
-    one, two = (CHOSEN[name](PARAMS[name], x, own) for x in (pair, other))
+    one, two = (CHOSEN[name](params_of(name), x, own) for x in (pair, other))
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
@@ -107,8 +113,8 @@ def test_features_of_absent_entities_have_no_influence(name, scale):
 def test_groups_without_slots_are_empty_groups(name):
     pair, own = groups(3)
     empty = tuple(x.replace(mask=jnp.zeros_like(x.mask)) for x in pair)
-    (_, one), gradient = CHOSEN[name](PARAMS[name], empty, own)
-    (_, two), no_slots_gradient = CHOSEN[name](PARAMS[name], groups(3, (0, 0))[0], own)
+    (_, one), gradient = CHOSEN[name](params_of(name), empty, own)
+    (_, two), no_slots_gradient = CHOSEN[name](params_of(name), groups(3, (0, 0))[0], own)
     np.testing.assert_array_equal(one, two)
     for leaf in jax.tree.leaves((one, gradient, no_slots_gradient)):
         assert np.isfinite(leaf).all()

@@ -48,15 +48,15 @@ def test_a_policy_trained_with_10_agents_gathers_40():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "fields", "score"),
+    ("name", "fields"),
     [
-        ("rendezvous", {"visibility_radius": 60.0}, -150.0),
-        ("pursuit", {"visibility_radius": 30.0, "evader_visibility_radius": 50.0}, 0.0),
-        ("rendezvous", {"num_agents": 20, "active_agents": (5, 20)}, -100.0),
+        ("rendezvous", {"visibility_radius": 60.0}),
+        ("pursuit", {"visibility_radius": 30.0, "evader_visibility_radius": 50.0}),
+        ("rendezvous", {"active_agents": (5, 20)}),
     ],
 )
-def test_swarms_with_limited_sight_and_of_changing_size_learn(name, fields, score):
+def test_swarms_with_limited_sight_and_of_changing_size_learn(name, fields):
     experiment = Experiment(TASKS[name](**fields), ActorCritic(), LEARNERS["ppo"]())
     _, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 41)
-    returns = metrics["eval/return"][::10]
-    assert returns[-1] > score
+    untrained, *_, trained = metrics["eval/return"][::10]
+    assert trained > 0.7 * untrained  # of the distance that makes up the loss, a third is gone at least

@@ -173,10 +173,13 @@ def test_numbers_are_leaves_to_be_mapped_over(task):
         state, outcome = step(task, KEY, reset(task, KEY), random_actions(task))
         return outcome, observe(task, state)
 
-    for name in names:
-        values = getattr(task, name) * jnp.array([0.5, 1.0])
-        outcomes = jax.vmap(lambda value, name=name: play(task.replace(**{name: value})))(values)
-        assert_close(jax.tree.map(lambda leaf: leaf[1], outcomes), play(task), atol=1e-5)
+    others = [task.replace(**{name: 0.5 * getattr(task, name)}) for name in names]
+    tasks = jax.tree.map(lambda *leaves: jnp.array(leaves), task, *others)
+    outcomes = jax.vmap(play)(tasks)
+    assert_close(jax.tree.map(lambda leaf: leaf[0], outcomes), play(task), atol=1e-5)
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(outcomes)]
+    for index in range(1, len(names) + 1):
+        assert any(not np.array_equal(leaf[0], leaf[index], equal_nan=True) for leaf in leaves)
 
 
 def test_trees_of_tasks_can_be_rebuilt(task):

@@ -61,6 +61,7 @@ def test_evaluations_are_due_before_every_second_update(run):
     np.testing.assert_array_equal(np.isfinite(metrics["eval/return"]), [True, False, True, False, True])
 
 
+@pytest.mark.slow
 def test_evaluation_does_not_change_training(run):
     state, expected, _ = run
     without = EXPERIMENT.replace(eval_every=1000)
