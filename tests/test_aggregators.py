@@ -1,8 +1,7 @@
 """What every aggregator promises, over groups of any size; and what each one computes, against formulas in NumPy."""
 
-import itertools
-
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp

@@ -126,6 +126,7 @@ def assert_same_outputs(one, one_tree, two, two_tree, obs):
     np.testing.assert_allclose(*values, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_separate_encoders_of_the_same_weights_are_a_shared_one():
     obs = pursuit_like(num_rows=4)
     shared, separate = (
@@ -147,6 +148,7 @@ def test_separate_encoders_of_the_same_weights_are_a_shared_one():
     assert_same_outputs(shared, tree, separate, split_tree, obs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variance_encoder", ["shared", "separate"])
 def test_a_second_stage_is_further_layers_that_all_groups_share(variance_encoder):
     options = {"decoder": (5,), "aggregator": AGGREGATORS["bayesian"](variance_encoder=variance_encoder)}
