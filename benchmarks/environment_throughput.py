@@ -1,6 +1,6 @@
 """Steps per second of every task with random actions, observations included; prints one JSON object per line.
 
-    python benchmarks/environment_throughput.py [worlds=1,64,1024,8192] [agents=10,50,200] [tasks=pursuit] [repeats=3] [out=FILE]
+    python benchmarks/environment_throughput.py [worlds=1,64,...] [agents=10,50,...] [tasks=pursuit,...] [repeats=3] [out=FILE]
 
 `environment_steps_per_second` are steps of single worlds, `agent_steps_per_second` those times the agents. Each step is
 followed by the observation of all agents, of which every number is used. Finished episodes restart from a few start
@@ -84,13 +84,8 @@ def measure(name, num_worlds, num_agents, repeats):
 
 
 def main(arguments):
-    options = {
-        "worlds": "1,64,1024,8192",
-        "agents": "10,50,200",
-        "tasks": ",".join(TASK_FIELDS),
-        "repeats": "3",
-        "out": "",
-    }
+    options = {"worlds": "1,64,1024,8192", "agents": "10,50,200", "repeats": "3", "out": ""}
+    options["tasks"] = ",".join(TASK_FIELDS)
     options |= dict(argument.split("=", 1) for argument in arguments)
     worlds, agents = ([int(number) for number in options[name].split(",")] for name in ("worlds", "agents"))
     about = reporting.provenance()
