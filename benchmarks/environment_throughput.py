@@ -1,6 +1,6 @@
 """Steps per second of every task with random actions, observations included; prints one JSON object per line.
 
-    python benchmarks/environment_throughput.py [worlds=1,64,...] [agents=10,50,...] [tasks=pursuit,...] [repeats=3] [out=FILE]
+    python benchmarks/environment_throughput.py [worlds=1,64] [agents=10,50] [tasks=pursuit] [repeats=3] [out=FILE]
 
 `environment_steps_per_second` are steps of single worlds, `agent_steps_per_second` those times the agents. Each step is
 followed by the observation of all agents, of which every number is used. Finished episodes restart from a few start
