@@ -8,13 +8,13 @@ process: recomputed activations and everything that is no matrix product count f
 """
 
 import json
-import resource
 import statistics
 import sys
 import time
 from functools import partial
 
 import jax
+from timing import gemm_flops, peak_memory, seconds
 
 from jaxswarm import config, init, reporting, rollout, train
 from jaxswarm.training import Experiment, evaluate
@@ -38,24 +38,6 @@ def useful_flops(experiment: Experiment, params: dict) -> int:
         is_first = group is not None and inputs == group.features.shape[-1]
         total += 2 * inputs * outputs * uses * (2 if is_first else 3)
     return total
-
-
-def seconds(function, *args, repeats: int) -> float:
-    """Median time of a call, after one that does not count."""
-    jax.block_until_ready(function(*args))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*args))
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
-
-
-def peak_memory() -> float:
-    """MiB: of the device where it tells, else of this process."""
-    statistics_of_device = jax.local_devices()[0].memory_stats() or {}
-    in_bytes = statistics_of_device.get("peak_bytes_in_use", 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    return in_bytes / 2**20
 
 
 def main(words: list[str]) -> None:
@@ -82,19 +64,16 @@ def main(words: list[str]) -> None:
         key = jax.random.key(2)
         return experiment.learner.update(key, state.learner, experiment.network, experiment.task, trajectory)
 
-    matrix = jax.random.normal(jax.random.key(3), (2048, 2048))
-    product = jax.jit(lambda x: x @ x)
-    before = seconds(product, matrix, repeats=9)
+    gemm_before = gemm_flops()
     _, trajectory, _ = collect(state)
     rollout_seconds = seconds(collect, state, repeats=repeats)
     update_seconds = seconds(update, state, trajectory, repeats=repeats)
     evaluate_seconds = seconds(evaluate, experiment, state, repeats=repeats)
     loop_seconds = seconds(program, experiment, state, repeats=repeats)
-    gemm = 2 * 2048**3 / statistics.mean([before, seconds(product, matrix, repeats=9)])
+    gemm = statistics.mean([gemm_before, gemm_flops()])
 
     steps = experiment.agent_steps_per_update
     flops = useful_flops(experiment, state.learner.params) * steps * experiment.learner.num_epochs / update_seconds
-    manifest = reporting.manifest(experiment, experiment.eval_every, 0)
     result = {
         "benchmark": "training_throughput",
         "setting": words,
@@ -111,7 +90,7 @@ def main(words: list[str]) -> None:
         "gemm_fraction": flops / gemm,
     }
     rounded = {name: float(f"{x:.4g}") if isinstance(x, float) else x for name, x in result.items()}
-    print(json.dumps(rounded | {key: manifest[key] for key in ("versions", "device", "platform", "git_revision")}))
+    print(json.dumps(rounded | reporting.provenance()))
 
 
 if __name__ == "__main__":

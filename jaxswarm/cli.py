@@ -30,14 +30,14 @@ examples
 """
 
 EVAL_HELP = """\
-jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [task.key=value] ...
+jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [task.key=value[,value...]] ...
 
-Evaluates the trained policy of a run folder, also on a changed task: prints a table and writes JSON into the folder.
+Evaluates the trained policy of a run folder, also on changed tasks: prints a table and writes JSON into the folder.
 The action is the mean of the policy; each episode is played in a world of its own.
 
 examples
   jaxswarm-eval runs/thesis
-  jaxswarm-eval runs/thesis episodes=100 checkpoint=last task.num_agents=50
+  jaxswarm-eval runs/thesis episodes=100 checkpoint=last task.num_agents=5,10,20,50,100,200
 """
 
 
@@ -94,14 +94,17 @@ def evaluate(arguments: Sequence[str]) -> int:
     config = _load(Path(paths[0]))
     episodes = _whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
     seed = _whole("seed", options.get("seed", 0), 0)
-    changed = configs.override(config, _only(words, lambda key: key.startswith("task."), "task.<field>=value"))
-    result = _evaluate(Path(paths[0]), config, changed["task"], {"which": which, "seed": seed, "episodes": episodes})
+    changes = configs.combinations(words)
+    _only(changes[0], lambda key: key.startswith("task."), "task.<field>=value")
+    asked = {"which": which, "seed": seed, "episodes": episodes}
+    result = _evaluate(Path(paths[0]), config, changes, asked)
     return _report(Path(paths[0]), result) if result else 1
 
 
 def _resume(run_dir: Path, words: Sequence[str]) -> int:
     config = _load(run_dir)
-    pairs = _only(words, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
+    pairs = configs.parse(words)
+    _only(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
     extended = configs.override(config, pairs)
     if pairs:
         per_update = configs.build(config).agent_steps_per_update
@@ -147,9 +150,13 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
     return 0
 
 
-def _evaluate(run_dir: Path, config: Config, task_config: Config, asked: dict[str, Any]) -> dict[str, Any] | None:
-    """Plays the episodes; `None` after saying that no checkpoint can be restored."""
-    experiment, task = configs.build(config), configs.build_part("task", {"task": task_config})
+def _evaluate(
+    run_dir: Path, config: Config, changes: Sequence[Sequence[tuple[str, Any]]], asked: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Plays the episodes of every changed task; `None` after saying that no checkpoint can be restored."""
+    experiment = configs.build(config)
+    tasks = [configs.override(config, pairs)["task"] for pairs in changes]
+    built = [configs.build_part("task", {"task": task}) for task in tasks]
     _use_compile_cache()
     import jax  # noqa: PLC0415
 
@@ -166,17 +173,22 @@ def _evaluate(run_dir: Path, config: Config, task_config: Config, asked: dict[st
     if restored is None:
         raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: {_resume_command(run_dir)}")
     params, key = restored.train_state.learner.params, jax.random.key(asked["seed"])
-    needed = jax.eval_shape(lambda: experiment.network.init(key, task.observe(task.reset(key))))
-    if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape, params):
-        raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
+    for task in built:
+        needed = jax.eval_shape(lambda task=task: experiment.network.init(key, task.observe(task.reset(key))))
+        if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape, params):
+            raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
 
-    def play(params: Any) -> dict[str, Any]:
+    @jax.jit
+    def play(params: Any, task: Any) -> dict[str, Any]:
         policy: Any = functools.partial(experiment.network.apply, params, method="policy")
         return rollout.evaluate(key, task, policy, asked["episodes"])
 
-    metrics = {name: float(x) for name, x in jax.jit(play)(params).items()}
+    results = [
+        {"changed": dict(pairs), "task": task, "metrics": {name: float(x) for name, x in play(params, b).items()}}
+        for pairs, task, b in zip(changes, tasks, built, strict=True)
+    ]
     found = {"update": restored.update, "score_in_training": restored.score, "device": jax.devices()[0].device_kind}
-    return asked | found | {"task": task_config, "metrics": metrics}
+    return asked | found | {"results": results}
 
 
 def _report(run_dir: Path, result: dict[str, Any]) -> int:
@@ -187,11 +199,19 @@ def _report(run_dir: Path, result: dict[str, Any]) -> int:
         name += "x"
     replace_text(path, json.dumps(result, indent=2) + "\n")
     print(f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes")
-    width = max(map(len, result["metrics"]))
-    for metric, value in sorted(result["metrics"].items(), key=lambda item: not item[0].startswith("return")):
-        print(f"  {metric:<{width}}  {value:12.4f}")
+    print(_table(result["results"]))
     print(f"wrote {path}")
     return 0
+
+
+def _table(results: Sequence[dict[str, Any]]) -> str:
+    """A row per metric, returns first; a column per changed task."""
+    metrics = sorted(results[0]["metrics"], key=lambda name: not name.startswith("return"))
+    rows = [[key, *[str(result["changed"][key]) for result in results]] for key in results[0]["changed"]]
+    rows += [[name, *[f"{result['metrics'][name]:.4f}" for result in results]] for name in metrics]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = [[x.rjust(width) for x, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(["", row[0].ljust(widths[0]), *line[1:]]) for row, line in zip(rows, cells, strict=True))
 
 
 def _wants_help(arguments: Sequence[str]) -> bool:
@@ -227,12 +247,10 @@ def _split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, st
     return options, words
 
 
-def _only(words: Sequence[str], is_accepted: Callable[[str], bool], accepted: str) -> list[tuple[str, Any]]:
-    pairs = configs.parse(words)
+def _only(pairs: Sequence[tuple[str, Any]], is_accepted: Callable[[str], bool], accepted: str) -> None:
     for key, _ in pairs:
         if not is_accepted(key):
             raise ConfigError(f"{key} cannot be changed here; accepted: {accepted}")
-    return pairs
 
 
 def _whole(name: str, value: Any, least: int) -> int:

@@ -113,33 +113,43 @@ def dump(config: Config) -> str:
     return OmegaConf.to_yaml(OmegaConf.create(config))
 
 
-def parse(words: Iterable[str]) -> list[tuple[str, Any]]:
+def parse(words: Sequence[str]) -> list[tuple[str, Any]]:
     """Keys and values of `key=value` words."""
+    several = [word for word in words if len(combinations([word])) > 1]
+    if several:
+        raise ConfigError(f"cannot read {several[0]!r}; accepted: key=value with one value, lists as key=[1,2]")
+    return combinations(words)[0]
+
+
+def combinations(words: Sequence[str]) -> list[list[tuple[str, Any]]]:
+    """Keys and values of `key=value` words; of words like `key=a,b` every combination of values."""
     from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
     from hydra.core.override_parser.types import OverrideType  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415
 
-    parser, pairs = OverridesParser.create(), []
+    parser, choices = OverridesParser.create(), []
     for word in words:
         try:
             parsed = parser.parse_override(word)
         except HydraException as error:
             raise ConfigError(f"cannot read {word!r}; accepted: key=value, lists as key=[1,2]") from error
-        if parsed.type is not OverrideType.CHANGE or parsed.package or parsed.is_sweep_override():
-            raise ConfigError(f"cannot read {word!r}; accepted: key=value with one value, lists as key=[1,2]")
-        pairs.append((parsed.key_or_group, parsed.value()))
-    return pairs
+        is_range = parsed.is_sweep_override() and not parsed.is_choice_sweep()
+        if parsed.type is not OverrideType.CHANGE or parsed.package or is_range:
+            raise ConfigError(f"cannot read {word!r}; accepted: key=value, lists as key=[1,2]")
+        values = parsed.sweep_iterator() if parsed.is_choice_sweep() else [parsed.value()]
+        choices.append([(parsed.key_or_group, value) for value in values])
+    return [list(pairs) for pairs in itertools.product(*choices)]
 
 
 def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
-    """The config with other values at dotted keys, checked. A given length replaces the other way to say it."""
+    """The config with other values at these keys, checked. A given length replaces the other way to say it."""
     config = {key: dict(value) if isinstance(value, dict) else value for key, value in config.items()}
     pairs = list(pairs)
     lengths = {key for key, _ in pairs} & set(LENGTHS)
     if len(lengths) == 1:
         config |= dict.fromkeys(set(LENGTHS) - lengths)
     for key, value in pairs:
-        head, _, tail = key.partition(".")
+        head, _, tail = _full_key(key, config).partition(".")
         if not tail:
             if isinstance(config.get(key), dict):
                 raise ConfigError(f"{key} = {value!r} is not possible; accepted: {key}.<field>=value")
@@ -149,6 +159,17 @@ def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
         else:
             raise _unknown(key, "", config)
     return validate(config)
+
+
+def _full_key(key: str, config: Config) -> str:
+    """A field's name stands for `part.name` where only one part has it."""
+    if "." in key or key in config or key in _top_fields():
+        return key
+    owners = [part for part in PARTS if key in _fields(part, config[part])]
+    if len(owners) > 1:
+        choice = " or ".join(f"{part}.{key}" for part in owners)
+        raise ConfigError(f"{key} is a field of {' and '.join(owners)}; accepted: {choice}")
+    return f"{owners[0]}.{key}" if owners else key
 
 
 def validate(config: Config) -> Config:
@@ -170,7 +191,7 @@ def build(config: Config) -> "Experiment":
         raise ConfigError("network.encoder = [] is not possible; accepted: at least one layer, like [64]")
     try:
         task = build_part("task", config)
-        fields: Any = {name: tuple(x) if isinstance(x, list) else x for name, x in config["network"].items()}
+        fields = _tuples(config["network"])
         network = ActorCritic(**fields, aggregator=build_part("aggregator", config), action_dim=task.action_dim)
         sizes = {name: config[name] for name in _experiment_fields()}
         return Experiment(task, network, build_part("learner", config), **sizes)
@@ -182,11 +203,16 @@ def build(config: Config) -> "Experiment":
 
 def build_part(part: str, config: Config) -> Any:
     """The registered class of one part, built with its fields."""
-    fields = dict(config[part])
+    fields = _tuples(config[part])
     try:
         return _registries()[part][fields.pop("name")](**fields)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{part}: {error}") from error
+
+
+def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    """Lists as the tuples that constructors take."""
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
 
 
 def run_settings(config: Config) -> Run:

@@ -9,4 +9,14 @@ Policy = distrax.MultivariateNormalDiag
 
 def gaussian(mean: Float[Array, "*batch dim"], log_std: Float[Array, "*#batch dim"]) -> Policy:
     """Diagonal Gaussian with mean and log standard deviation."""
-    return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))
+    return gaussian_with_std(mean, jnp.exp(log_std))
+
+
+def gaussian_with_std(mean: Float[Array, "*batch dim"], std: Float[Array, "*#batch dim"]) -> Policy:
+    """Diagonal Gaussian with mean and standard deviation."""
+    return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))
+
+
+def mean_and_std(policy: Policy) -> tuple[Float[Array, "*batch dim"], Float[Array, "*batch dim"]]:
+    """Mean and standard deviation."""
+    return jnp.asarray(policy.mean()), jnp.asarray(policy.stddev())

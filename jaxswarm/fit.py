@@ -32,7 +32,6 @@ SECONDS_PER_CHUNK = 1.0  # between signs of life, where an update is quicker tha
 MAX_CHUNK = 64  # updates
 
 _run_chunk = jax.jit(train_chunk, static_argnames="size", donate_argnames="train_state")
-_init = jax.jit(init)
 
 
 @jax.jit
@@ -108,7 +107,7 @@ def fit(
             keep_checkpoints=keep_checkpoints,
         )
         try:
-            train_state = restored.train_state if restored else _init(experiment, jax.random.key(seed))
+            train_state = restored.train_state if restored else init(experiment, jax.random.key(seed))
             train_state = _train(
                 experiment, train_state, update=start, num_updates=num_updates, stop=stop, recorder=recorder
             )

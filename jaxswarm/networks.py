@@ -1,7 +1,7 @@
 """Networks: an encoder per group, an aggregator, a decoder, and the heads of actor and critic."""
 
 import math
-from functools import partial
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ _HIDDEN_INIT = nn.initializers.orthogonal(math.sqrt(2.0))
 
 
 class Encoder(nn.Module):
-    """Dense layers, each followed by the activation, the last one included.
+    """Dense layers, each followed by the activation, the last one included; then a second stage, if there is one.
 
     The last layer yields the parts of a message by one matrix product each, initialised as one matrix.
     """
@@ -32,6 +32,7 @@ class Encoder(nn.Module):
     widths: tuple[int, ...]
     activation: str
     num_parts: int = 1
+    second_stage: nn.Module | None = None
 
     @nn.compact
     def __call__(self, features: Float[Array, "n dim"]) -> tuple[Float[Array, "n width"], ...]:
@@ -44,16 +45,30 @@ class Encoder(nn.Module):
         kernel = self.param("kernel", _HIDDEN_INIT, (x.shape[-1], size))
         bias = self.param("bias", nn.initializers.zeros, (size,))
         parts = zip(jnp.split(kernel, self.num_parts, 1), jnp.split(bias, self.num_parts), strict=True)
-        return tuple(activation(x @ k + b[None]) for k, b in parts)
+        outputs = tuple(activation(x @ k + b[None]) for k, b in parts)
+        return outputs if self.second_stage is None else self.second_stage(*outputs)
+
+
+class Beside(nn.Module):
+    """Encoders of the same entities, one for each part of a message; with none, the features are the message."""
+
+    encoders: tuple[nn.Module, ...]
+
+    def __call__(self, features: Float[Array, "n dim"]) -> tuple[Float[Array, "n width"], ...]:
+        """The parts one after the other."""
+        encoders: tuple[Any, ...] = self.encoders
+        return tuple(part for encoder in encoders for part in encoder(features)) if encoders else (features,)
 
 
 class Tower(nn.Module):
     """Encodes and aggregates every group, then decodes [own, aggregate of each group in order of name].
 
     With `latent_space="shared"` the groups keep their encoders but are aggregated together, into one vector.
+    `shared_encoder` are layers after the encoder of each group, the same for all groups.
     """
 
     encoder: tuple[int, ...]
+    shared_encoder: tuple[int, ...]
     decoder: tuple[int, ...]
     activation: str
     aggregator: Any
@@ -63,46 +78,65 @@ class Tower(nn.Module):
     def __call__(self, own: Float[Array, "n own_dim"], groups: dict[str, Entities]) -> Float[Array, "n latent"]:
         """Latent vector of each receiver."""
         names = sorted(groups)
-        encoders = {
-            name: Encoder(self.encoder, self.activation, self.aggregator.num_parts, name=f"{name}_encoder")
-            for name in names
-        }
+        if self.latent_space == "shared" and self.aggregator.num_encoders == 0 and len(names) > 1:
+            raise ValueError(
+                f"latent_space = 'shared' is not possible for {', '.join(names)}: {type(self.aggregator).__name__} "
+                "takes the features of entities as they are; accepted: separate"
+            )
+        encoders = self._encoders(names)
         pools = {"groups": names} if self.latent_space == "shared" else {name: [name] for name in names}
         x = [own]
         for pool, members in pools.items():
             aggregator = self.aggregator.copy(name=f"{pool}_aggregator")
-            x.append(
-                sets.encode_and_reduce(
-                    aggregator, [encoders[m] for m in members], [groups[m] for m in members], self.encoder[-1]
-                )
-            )
+            inputs = tuple(groups[m] for m in members)
+            is_encoded = self.aggregator.num_encoders > 0
+            width = (*self.encoder, *self.shared_encoder)[-1] if is_encoded else inputs[0].features.shape[-1]
+            x.append(sets.Pool(aggregator, tuple(encoders[m] for m in members), width)(inputs, own))
         latent = jnp.concatenate(x, -1)
         for width in self.decoder:
             latent = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=_HIDDEN_INIT)(latent))
         return latent
 
+    def _encoders(self, names: list[str]) -> dict[str, nn.Module]:
+        """One for each group; with several encoders for the parts of a message, all but the first have a number."""
+        numbers = ["", *(f"_{i}" for i in range(1, self.aggregator.num_encoders))][: self.aggregator.num_encoders]
+        num_parts = self.aggregator.num_parts // max(len(numbers), 1)
+
+        def encoder(widths: tuple[int, ...], name: str, second_stage: nn.Module | None = None) -> nn.Module:
+            return Encoder(widths, self.activation, 1 if second_stage else num_parts, second_stage, name=name)
+
+        shared = {n: encoder(self.shared_encoder, f"second_stage{n}") if self.shared_encoder else None for n in numbers}
+        return {m: Beside(tuple(encoder(self.encoder, f"{m}_encoder{n}", shared[n]) for n in numbers)) for m in names}
+
 
 class ActorCritic(nn.Module):
-    """Actor and critic as two separate towers, shared by all agents; the standard deviation depends on no state.
+    """Actor and critic as two separate towers, shared by all agents.
 
-    `encoder` and `decoder` are layer widths; the last encoder width is the size of an aggregate. Initialisation:
-    orthogonal with gain sqrt(2) inside, 0.01 for the action mean, 1 for the value, log standard deviation 0.
+    `encoder`, `shared_encoder` and `decoder` are layer widths: of each group's own encoder, of layers after it that all
+    groups share, and of what follows the aggregates, whose size is the last width before. The log standard deviation
+    of actions is one parameter, the same in all states, or with `std="state"` a second head of the actor.
+    Initialisation: orthogonal with gain sqrt(2) inside, 0.01 for the action mean and for the head of the log standard
+    deviation, 1 for the value, shared log standard deviation 0.
     """
 
     encoder: tuple[int, ...] = (64,)
     decoder: tuple[int, ...] = (64,)
+    shared_encoder: tuple[int, ...] = ()
     activation: Literal["leaky_relu", "relu", "tanh"] = "leaky_relu"
     aggregator: nn.Module = Mean()
     latent_space: Literal["separate", "shared"] = "separate"
+    std: Literal["shared", "state"] = "shared"
     action_dim: int = 2
 
     def setup(self) -> None:  # noqa: D102
-        tower = partial(Tower, self.encoder, self.decoder, self.activation, self.aggregator, self.latent_space)
-        self.actor = tower()
-        self.critic = tower()
+        layers = (self.encoder, self.shared_encoder, self.decoder, self.activation)
+        self.actor, self.critic = (Tower(*layers, self.aggregator, self.latent_space) for _ in range(2))
         self.action_mean = nn.Dense(self.action_dim, kernel_init=nn.initializers.orthogonal(0.01))
         self.value_head = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0))
-        self.log_std = self.param("log_std", nn.initializers.zeros, (self.action_dim,))
+        if self.std == "state":
+            self.action_log_std = nn.Dense(self.action_dim, kernel_init=nn.initializers.orthogonal(0.01))
+        else:
+            self.log_std = self.param("log_std", nn.initializers.zeros, (self.action_dim,))
 
     def __call__(self, obs: Observation) -> tuple[Policy, Float[Array, "*receivers"]]:
         """Policy and value of every receiver; `obs` may have any leading axes."""
@@ -112,11 +146,18 @@ class ActorCritic(nn.Module):
         """Action distribution of every receiver."""
         latent = self.actor(*_flat(obs))
         mean = self.action_mean(latent).reshape(*obs.own.shape[:-1], self.action_dim)
+        if self.std == "state":
+            return gaussian(mean, self.action_log_std(latent).reshape(mean.shape))
         return gaussian(mean, self.log_std.reshape([1] * (mean.ndim - 1) + [-1]))
 
     def value(self, obs: Observation) -> Float[Array, "*receivers"]:
         """Value estimate of every receiver."""
         return self.value_head(self.critic(*_flat(obs))).reshape(obs.own.shape[:-1])
+
+
+def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:
+    """The parameters of an `ActorCritic` with `std="shared"`, with another log standard deviation."""
+    return params | {"params": params["params"] | {"log_std": function(params["params"]["log_std"])}}
 
 
 def _flat(obs: Observation) -> tuple[Float[Array, "n own_dim"], dict[str, Entities]]:

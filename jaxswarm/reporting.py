@@ -29,7 +29,6 @@ SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal to draw a bar on
 
 def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
     """Versions, device, revision and the exact arithmetic of steps."""
-    device = jax.devices()[0]
     per_update = experiment.agent_steps_per_update
     steps = {
         "updates": num_updates,
@@ -43,15 +42,24 @@ def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
         "evaluations": math.ceil(num_updates / experiment.eval_every) + 1,
         "episodes_per_evaluation": experiment.eval_worlds,
     }
-    learner = experiment.learner
-    if hasattr(learner, "num_epochs") and hasattr(learner, "batch_size"):
-        gradient_steps = learner.num_epochs * per_update // learner.batch_size
-        steps |= {"gradient_steps_per_update": gradient_steps, "gradient_steps": num_updates * gradient_steps}
+    gradient_steps = experiment.learner.num_epochs * per_update // experiment.batch_size
+    steps |= {
+        "samples_per_gradient_step": experiment.batch_size,
+        "gradient_steps_per_update": gradient_steps,
+        "gradient_steps": num_updates * gradient_steps,
+    }
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "command": sys.argv,
         "seeds": [seed],
         "steps": steps,
+    } | provenance()
+
+
+def provenance() -> dict[str, Any]:
+    """What code ran on what machine."""
+    device = jax.devices()[0]
+    return {
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES},
         "platform": platform.platform(),
         "device": {"backend": device.platform, "kind": device.device_kind, "count": jax.device_count()},

@@ -23,10 +23,13 @@ class Trajectory:
     state: Any
     action: Float[Array, "steps worlds agents action_dim"]  # as sampled, not clipped
     log_prob: Float[Array, "steps worlds agents"]
+    action_mean: Float[Array, "steps worlds agents action_dim"]  # of the policy that acted
+    action_std: Float[Array, "steps worlds agents action_dim"]
     reward: Float[Array, "steps worlds"]
     terminated: Bool[Array, "steps worlds"]
     truncated: Bool[Array, "steps worlds"]
     final_state: Any
+    mask: Bool[Array, "steps worlds agents"] | None  # agents that exist; None: all do
 
 
 @pytree
@@ -65,17 +68,21 @@ def collect(
     def step(carry: tuple, key: Key) -> tuple:
         worlds, num_resets, totals = carry
         action_key, world_key = jax.random.split(key)
-        distribution = policy(jax.vmap(task.observe)(worlds.state))
+        obs = jax.vmap(task.observe)(worlds.state)
+        distribution = policy(obs)
         action = distribution.sample(seed=action_key)
         final_state, outcome = _step_worlds(world_key, task, worlds.state, action)
         transition = Trajectory(
             worlds.state,
             action,
             distribution.log_prob(action),
+            distribution.mean(),
+            distribution.stddev(),
             outcome.reward,
             outcome.terminated,
             outcome.truncated,
             final_state,
+            obs.mask,
         )
         is_done = outcome.terminated | outcome.truncated
         episode_return = worlds.episode_return + outcome.reward
@@ -102,41 +109,37 @@ def collect(
 def evaluate(key: Key, task: Any, policy: PolicyFn, num_worlds: int) -> Metrics:
     """One whole episode in each of fresh worlds with the mean action: undiscounted returns and the task's own metrics.
 
-    The task's metrics are averaged over the steps of an episode, then over episodes; `final_...` is the last step's.
+    The task's metrics are averaged over the steps of an episode, then over episodes. A metric that is NaN at a step
+    says nothing there: only the other steps count, and only episodes that have any.
     """
     reset_key, step_key = jax.random.split(key)
-    state = jax.vmap(task.reset)(jax.random.split(reset_key, num_worlds))
+    start = jax.vmap(task.reset)(jax.random.split(reset_key, num_worlds))
 
     def step(carry: tuple, key: Key) -> tuple:
-        state, is_running, totals, final = carry
+        state, is_running, returns, lengths, totals, counts = carry
         action = policy(jax.vmap(task.observe)(state)).mean()
         state, outcome = _step_worlds(key, task, state, action)
-        now = outcome.metrics | {"return": outcome.reward, "episode_length": jnp.ones(num_worlds)}
-        totals = jax.tree.map(lambda total, x: total + jnp.where(is_running, x, 0.0), totals, now)
-        final = jax.vmap(_select)(is_running, outcome.metrics, final)
-        return (state, is_running & ~(outcome.terminated | outcome.truncated), totals, final), None
+        counted = {name: is_running & ~jnp.isnan(x) for name, x in outcome.metrics.items()}
+        totals = {name: totals[name] + jnp.where(counted[name], x, 0.0) for name, x in outcome.metrics.items()}
+        counts = {name: counts[name] + x for name, x in counted.items()}
+        returns = returns + jnp.where(is_running, outcome.reward, 0.0)
+        is_over = outcome.terminated | outcome.truncated
+        return (state, is_running & ~is_over, returns, lengths + is_running, totals, counts), None
 
-    outcome = jax.eval_shape(lambda: _step_worlds(step_key, task, state, _zero_action(task, num_worlds))[1])
-    zeros = {name: jnp.zeros(num_worlds) for name in outcome.metrics}
-    totals = zeros | {"return": jnp.zeros(num_worlds), "episode_length": jnp.zeros(num_worlds)}
-    carry = (state, jnp.ones(num_worlds, bool), totals, zeros)
-    (_, _, totals, final), _ = jax.lax.scan(step, carry, jax.random.split(step_key, task.episode_length))
-    returns, length = totals.pop("return"), totals.pop("episode_length")
-    return (
-        {"return": returns.mean(), "return_std": returns.std(), "episode_length": length.mean()}
-        | {name: (total / length).mean() for name, total in totals.items()}
-        | {f"final_{name}": x.mean() for name, x in final.items()}
-    )
+    action = jnp.zeros((num_worlds, task.num_agents, task.action_dim))
+    names = jax.eval_shape(lambda: _step_worlds(step_key, task, start, action)[1]).metrics
+    zeros = dict.fromkeys(names, jnp.zeros(num_worlds))
+    carry = (start, jnp.ones(num_worlds, bool), jnp.zeros(num_worlds), jnp.zeros(num_worlds), zeros, zeros)
+    carry, _ = jax.lax.scan(step, carry, jax.random.split(step_key, task.episode_length))
+    _, _, returns, lengths, totals, counts = carry
+    means = {name: jnp.nanmean(total / counts[name]) for name, total in totals.items()}
+    return {"return": returns.mean(), "return_std": returns.std(), "episode_length": lengths.mean()} | means
 
 
 def _step_worlds(key: Key, task: Any, state: Any, action: Float[Array, "worlds agents action_dim"]) -> tuple[Any, Step]:
     """One step of every world; actions are clipped to the action box here."""
     keys = jax.random.split(key, action.shape[0])
     return jax.vmap(task.step)(keys, state, jnp.clip(action, -1.0, 1.0))
-
-
-def _zero_action(task: Any, num_worlds: int) -> Float[Array, "worlds agents action_dim"]:
-    return jnp.zeros((num_worlds, task.num_agents, task.action_dim))
 
 
 def _select(condition: Bool[Array, ""], on_true: Any, on_false: Any) -> Any:

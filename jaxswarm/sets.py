@@ -1,30 +1,64 @@
 """Groups of varying size: how messages are laid out and reduced, decided here once for every aggregator.
 
-A reduction is a commutative monoid: `lift` turns the message of one entity into a summary, summaries are combined by
-`reduction` (`"add"` or `"max"`), and `lower` turns the summary of a whole group into a vector. Absent entities
-contribute the identity, so they have exactly no influence on output and gradient.
+Most aggregators are commutative monoids: `lift` turns the message of one entity into a summary, summaries are combined
+by one of `REDUCTIONS`, and `lower` turns the summary of a whole group into a vector. Absent entities contribute the
+identity, so they have exactly no influence on output and gradient. The others see a group as a whole: `pool` takes its
+`DenseView`, [receivers, slots, features].
 
-Two layouts give the same result: a flat list of messages with the receiver of each (`reduce_segments`), and dense slots
-that are encoded, lifted and combined one slot at a time (`encode_and_reduce`), so that the hidden activations of all
-slots never exist at once. The second made forward and gradient of an encoder 3 to 8 times faster on CPU.
+Messages arrive as an irregular list with the receiver of each (`aggregate`), or as dense slots still to be encoded
+(`Pool`). Slots can be laid out in three ways, with the same result; `Pool` takes the one that was fastest:
+
+* streaming: one slot at a time is encoded, lifted and combined, so that the hidden activations of all slots never
+  exist at once; the backward pass encodes each slot again
+* dense: all slots at once, reduced along an axis; the only one that gives a dense view
+* segments: all slots as one list, reduced by segment operations
+
+On a CPU, receivers are taken in pieces whose activations stay in the cache. What was measured: benchmarks/LOG.md.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.types import Entities, pytree, static
 
 Summary = Any  # a pytree of arrays [receivers, ...]
+Layout = Literal["streaming", "dense", "segments"]
 
-_IDENTITY = {"add": 0.0, "max": -jnp.inf}
-_COMBINE = {"add": jnp.add, "max": jnp.maximum}
-_SEGMENT = {"add": jax.ops.segment_sum, "max": jax.ops.segment_max}
-_UNROLL = 10  # slots per loop iteration of the streaming layout; measured on CPU, see benchmarks/LOG.md
+LOWEST = float(np.finfo(np.float32).min)  # the identity of max; finite, so that differences are numbers
+_FASTEST: dict[str, Layout] = {"add": "streaming", "max": "dense", "scaled_add": "segments"}  # by reduction
+_UNROLL = 10  # slots per loop iteration of the streaming layout
+_PIECE = {"streaming": 2**16, "dense": 2**18, "segments": 2**18}  # numbers in one array of activations
+
+
+@pytree
+class Segments:
+    """The receiver of each message of a list, in any order; messages that are not present do not count.
+
+    Neither do those with a receiver outside of 0 ... num_receivers - 1. `max_group_size` bounds the messages of one
+    receiver where a dense view is needed (by default, all may have the same); of more, the first of the list count.
+    `own` is what receivers know of themselves, for aggregators that ask for it.
+    """
+
+    receiver: Int[Array, " messages"]
+    is_present: Bool[Array, " messages"]
+    num_receivers: int = static()
+    max_group_size: int | None = static(default=None)
+    own: Float[Array, "receivers own_dim"] | None = None
+
+
+@pytree
+class DenseView:
+    """Whole groups side by side; the messages of absent entities are arbitrary numbers of moderate size."""
+
+    messages: Float[Array, "receivers slots features"]
+    mask: Bool[Array, "receivers slots"]
+    own: Float[Array, "receivers own_dim"] | None = None
 
 
 @runtime_checkable
@@ -32,7 +66,8 @@ class Monoid(Protocol):
     """What a reduction provides.
 
     `lift` takes the `num_parts` arrays [entities, features] of which a message consists, and gives the summaries of
-    groups of one entity each; `lower` gives the vectors [receivers, out] that stand for groups.
+    groups of one entity each; `lower` gives the vectors [receivers, out] that stand for groups. `reduction` is a name
+    in `REDUCTIONS`.
     """
 
     num_parts: ClassVar[int]
@@ -41,67 +76,217 @@ class Monoid(Protocol):
     lower: Callable[[Summary], Array]
 
 
-@pytree
-class Segments:
-    """The receiver of each message of a flat list, in any order; messages that are not present do not count."""
+class Over(NamedTuple):
+    """Sum and maximum over the entities of each receiver, and back from receivers to their entities."""
 
-    receiver: Int[Array, " messages"]
-    is_present: Bool[Array, " messages"]
-    num_receivers: int = static()
+    add: Callable[[Array], Array]
+    max: Callable[[Array], Array]
+    spread: Callable[[Array], Array]
+
+
+class Reduction(NamedTuple):
+    """A commutative way to combine summaries: its identity in their shape, for two of them, and over many."""
+
+    identity: Callable[[Summary], Summary]
+    combine: Callable[[Summary, Summary], Summary]
+    reduce: Callable[[Summary, Over], Summary]
+
+
+def _constant(value: float) -> Callable[[Summary], Summary]:
+    return lambda like: jax.tree.map(lambda x: jnp.full_like(x, value), like)
+
+
+def _combine_scaled(one: Summary, two: Summary) -> Summary:
+    (exponent, values), (other_exponent, other_values) = one, two
+    top = jax.lax.stop_gradient(jnp.maximum(exponent, other_exponent))  # any number gives the same exp(m) values
+    scale, other_scale = jnp.exp(exponent - top), jnp.exp(other_exponent - top)
+    return top, jax.tree.map(lambda x, y: x * scale + y * other_scale, values, other_values)
+
+
+def _reduce_scaled(summary: Summary, over: Over) -> Summary:
+    exponent, values = summary
+    top = jax.lax.stop_gradient(over.max(exponent))
+    scale = jnp.exp(exponent - over.spread(top))
+    return top, jax.tree.map(lambda x: over.add(x * scale), values)
+
+
+REDUCTIONS = {
+    "add": Reduction(
+        _constant(0.0),
+        lambda one, two: jax.tree.map(jnp.add, one, two),
+        lambda summary, over: jax.tree.map(over.add, summary),
+    ),
+    "max": Reduction(
+        _constant(LOWEST),
+        lambda one, two: jax.tree.map(jnp.maximum, one, two),
+        lambda summary, over: jax.tree.map(over.max, summary),
+    ),
+    # (m, values) stands for exp(m) values, whose sum would overflow
+    "scaled_add": Reduction(
+        lambda like: (_constant(LOWEST)(like[0]), _constant(0.0)(like[1])), _combine_scaled, _reduce_scaled
+    ),
+}
 
 
 def segments_of(mask: Bool[Array, "receivers slots"]) -> Segments:
-    """The flat list of all slots, row by row."""
+    """The list of all slots, row by row."""
     num_receivers, num_slots = mask.shape
-    return Segments(jnp.repeat(jnp.arange(num_receivers), num_slots), mask.reshape(-1), num_receivers)  # pyright: ignore
+    receiver = jnp.repeat(jnp.arange(num_receivers), num_slots)
+    return Segments(receiver, mask.reshape(-1), num_receivers, num_slots)  # pyright: ignore[reportArgumentType]
 
 
-def _mask(monoid: Monoid, is_present: Bool[Array, " n"], summary: Summary) -> Summary:
-    """Replaces the summaries of absent entities by the identity."""
-
-    def select(x: Array) -> Array:
-        return jnp.where(is_present.reshape(-1, *[1] * (x.ndim - 1)), x, _IDENTITY[monoid.reduction])
-
-    return jax.tree.map(select, summary)
+def counts(segments: Segments) -> Bool[Array, " messages"]:
+    """Whether a message is present and has a receiver."""
+    return segments.is_present & (segments.receiver >= 0) & (segments.receiver < segments.num_receivers)
 
 
-def reduce_segments(
-    monoid: Monoid, messages: Float[Array, "messages features"], segments: Segments
+def aggregate(
+    aggregator: Any, messages: Float[Array, "messages features"], segments: Segments
 ) -> Float[Array, "receivers out"]:
-    """Aggregates a flat list of messages by receiver; a message is the concatenation of its parts."""
-    summary = _mask(monoid, segments.is_present, monoid.lift(*jnp.split(messages, monoid.num_parts, axis=-1)))
-    segment_reduce = _SEGMENT[monoid.reduction]
-    return monoid.lower(jax.tree.map(lambda x: segment_reduce(x, segments.receiver, segments.num_receivers), summary))
+    """Aggregates a list of messages by receiver; a message is the concatenation of its parts."""
+    is_present = counts(segments)
+    messages = jnp.where(is_present[:, None], messages, 0.0)
+    if not isinstance(aggregator, Monoid):
+        return aggregator.pool(dense_view(messages, segments))
+    summary = _lift(aggregator, is_present, jnp.split(messages, aggregator.num_parts, axis=-1))
+    return aggregator.lower(REDUCTIONS[aggregator.reduction].reduce(summary, _over_segments(segments)))
 
 
-def encode_and_reduce(
-    monoid: Monoid, encoders: Sequence[nn.Module], groups: Sequence[Entities], width: int
-) -> Float[Array, "receivers out"]:
-    """Encodes each group (features [receivers, slots, dim]) with its encoder and reduces all of them to one vector.
-
-    An encoder maps [receivers, dim] to `num_parts` arrays [receivers, width].
-    """
-    num_receivers = groups[0].mask.shape[0]
-    sample = monoid.lift(*[jnp.zeros((num_receivers, width))] * monoid.num_parts)
-    summary = jax.tree.map(lambda x: jnp.full_like(x, _IDENTITY[monoid.reduction]), sample)
-    for encoder, group in zip(encoders, groups, strict=True):
-        summary = _stream(monoid, encoder, group, summary)
-    return monoid.lower(summary)
+def aggregate_dense(aggregator: Any, view: DenseView) -> Float[Array, "receivers out"]:
+    """Aggregates the messages of a dense view."""
+    if not isinstance(aggregator, Monoid):
+        return aggregator.pool(view)
+    messages = view.messages.reshape(-1, view.messages.shape[-1])
+    summary = _lift(aggregator, view.mask.reshape(-1), jnp.split(messages, aggregator.num_parts, axis=-1))
+    summary = jax.tree.map(lambda x: x.reshape(*view.mask.shape, *x.shape[1:]), summary)
+    return aggregator.lower(REDUCTIONS[aggregator.reduction].reduce(summary, _OVER_SLOTS))
 
 
-def _stream(monoid: Monoid, encoder: nn.Module, group: Entities, summary: Summary) -> Summary:
-    """Adds a group to a summary, slot by slot; the backward pass encodes each slot again instead of storing it."""
-    combine: Callable = _COMBINE[monoid.reduction]
+def dense_view(messages: Float[Array, "messages features"], segments: Segments) -> DenseView:
+    """The messages of each receiver, in the order of the list."""
+    num_messages, num_receivers = messages.shape[0], segments.num_receivers
+    num_slots = num_messages if segments.max_group_size is None else segments.max_group_size
+    receiver = jnp.where(counts(segments), segments.receiver, num_receivers)  # the others are sorted to the end
+    order = jnp.argsort(receiver, stable=True)
+    receiver = receiver[order]
+    rank = jnp.arange(num_messages) - jnp.searchsorted(receiver, receiver)
+    features = jnp.zeros((num_receivers, num_slots, messages.shape[1]), messages.dtype)
+    features = features.at[receiver, rank].set(messages[order], mode="drop")
+    mask = jnp.zeros((num_receivers, num_slots), bool).at[receiver, rank].set(True, mode="drop")
+    return DenseView(features, mask, segments.own)
 
-    def add_slot(encoder: nn.Module, summary: Summary, slot: Entities) -> tuple[Summary, None]:
-        lifted = _mask(monoid, slot.mask, monoid.lift(*encoder(slot.features)))  # pyright: ignore[reportCallIssue]
-        return jax.tree.map(combine, summary, lifted), None
 
-    scan = nn.scan(
-        nn.remat(add_slot, prevent_cse=False),
-        variable_broadcast="params",
-        split_rngs={"params": False},
-        unroll=_UNROLL,
+def _lift(monoid: Monoid, is_present: Bool[Array, " n"], parts: Sequence[Array]) -> Summary:
+    """Summaries of single entities; those of absent ones are the identity."""
+    summary = monoid.lift(*parts)
+
+    def select(x: Array, identity: Array) -> Array:
+        return jnp.where(is_present.reshape(-1, *[1] * (x.ndim - 1)), x, identity)
+
+    return jax.tree.map(select, summary, REDUCTIONS[monoid.reduction].identity(summary))
+
+
+def _over_segments(segments: Segments) -> Over:
+    receiver, num_receivers = segments.receiver, segments.num_receivers
+    return Over(
+        add=lambda x: jax.ops.segment_sum(x, receiver, num_receivers),
+        max=lambda x: jnp.maximum(jax.ops.segment_max(x, receiver, num_receivers), LOWEST),
+        spread=lambda x: x.at[receiver].get(mode="fill", fill_value=0.0),
     )
-    slots = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), group)
-    return scan(encoder, summary, slots)[0]
+
+
+_OVER_SLOTS = Over(  # the second axis of arrays [receivers, slots, ...]
+    add=lambda x: x.sum(1),
+    max=lambda x: x.max(1, initial=LOWEST),
+    spread=lambda x: x[:, None],
+)
+
+
+class Pool(nn.Module):
+    """Encodes groups and aggregates all of them to one vector, in the layout that suits.
+
+    There is an encoder for each group; it maps [n, dim] to the parts of messages, each [n, width]. The modules may
+    belong to others, which then hold their parameters. Without a `layout` the fastest one is taken.
+    """
+
+    aggregator: Any
+    encoders: tuple[nn.Module, ...]
+    width: int
+    layout: Layout | None = None
+
+    def __call__(
+        self, groups: tuple[Entities, ...], own: Float[Array, "receivers own_dim"] | None = None
+    ) -> Float[Array, "receivers out"]:
+        """Vectors of the receivers of groups with features [receivers, slots, dim]; `own` is what they know."""
+        is_monoid = isinstance(self.aggregator, Monoid)
+        layout = self.layout or (_FASTEST[self.aggregator.reduction] if is_monoid else "dense")
+        num_receivers = groups[0].mask.shape[0]
+        groups = tuple(Entities(jnp.where(x.mask[..., None], x.features, 0.0), x.mask) for x in groups)
+        num_pieces = max(-(-num_receivers // self._piece_size(layout, groups)), 1)
+        if num_pieces == 1:
+            return getattr(self, layout)(groups, own)
+
+        def add_piece(self: "Pool", carry: None, piece: tuple) -> tuple[None, Array]:
+            return carry, getattr(self, layout)(*piece)
+
+        body = add_piece if layout == "streaming" else nn.remat(add_piece, prevent_cse=False)
+        scan = nn.scan(body, variable_broadcast="params", split_rngs={"params": False})
+        out = scan(self, None, jax.tree.map(lambda x: _split(x, num_pieces), (groups, own)))[1]
+        return out.reshape(-1, out.shape[-1])[:num_receivers]
+
+    def streaming(self, groups: tuple[Entities, ...], own: Array | None) -> Float[Array, "receivers out"]:
+        """One slot after the other; the backward pass encodes each again instead of storing it."""
+        del own
+        monoid: Monoid = self.aggregator
+        combine = REDUCTIONS[monoid.reduction].combine
+
+        def add_slot(encoder: nn.Module, summary: Summary, slot: Entities) -> tuple[Summary, None]:
+            parts = encoder(slot.features)  # pyright: ignore[reportCallIssue]
+            return combine(summary, _lift(monoid, slot.mask, parts)), None
+
+        scan = nn.scan(
+            nn.remat(add_slot, prevent_cse=False),
+            variable_broadcast="params",
+            split_rngs={"params": False},
+            unroll=_UNROLL,
+        )
+        sample = monoid.lift(*[jnp.zeros((groups[0].mask.shape[0], self.width))] * monoid.num_parts)
+        summary = REDUCTIONS[monoid.reduction].identity(sample)
+        for encoder, group in zip(self.encoders, groups, strict=True):
+            slots = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), group)
+            summary = scan(encoder, summary, slots)[0]
+        return monoid.lower(summary)
+
+    def dense(self, groups: tuple[Entities, ...], own: Array | None) -> Float[Array, "receivers out"]:
+        """All slots at once, reduced along an axis."""
+        return aggregate_dense(self.aggregator, self._encode(groups, own))
+
+    def segments(self, groups: tuple[Entities, ...], own: Array | None) -> Float[Array, "receivers out"]:
+        """All slots as one list, reduced by segment operations."""
+        view = self._encode(groups, own)
+        segments: Any = segments_of(view.mask)
+        messages = view.messages.reshape(-1, view.messages.shape[-1])
+        return aggregate(self.aggregator, messages, segments.replace(own=own))
+
+    def _encode(self, groups: tuple[Entities, ...], own: Array | None) -> DenseView:
+        def encode(encoder: Any, group: Entities) -> Array:
+            messages = jnp.concatenate(encoder(group.features.reshape(-1, group.features.shape[-1])), -1)
+            return messages.reshape(*group.mask.shape, messages.shape[-1])
+
+        messages = [encode(encoder, group) for encoder, group in zip(self.encoders, groups, strict=True)]
+        mask = jnp.concatenate([group.mask for group in groups], 1)
+        return DenseView(jnp.concatenate(messages, 1), mask, own)
+
+    def _piece_size(self, layout: Layout, groups: tuple[Entities, ...]) -> int:
+        """How many receivers are taken at once."""
+        if jax.default_backend() != "cpu":
+            return max(groups[0].mask.shape[0], 1)
+        num_slots = 1 if layout == "streaming" else sum(group.mask.shape[1] for group in groups)
+        return max(_PIECE[layout] // max(num_slots * self.width * self.aggregator.num_parts, 1), 1)
+
+
+def _split(x: Array, num_pieces: int) -> Array:
+    """Pieces of equal length along a new first axis, the last one filled with zeros: absent entities."""
+    size = -(-x.shape[0] // num_pieces)
+    padding = [(0, num_pieces * size - x.shape[0])] + [(0, 0)] * (x.ndim - 1)
+    return jnp.pad(x, padding).reshape(num_pieces, size, *x.shape[1:])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from jaxswarm import rollout
-from jaxswarm.learners.on_policy import LearnerState
+from jaxswarm.learners.on_policy import LearnerState, batch_size
 from jaxswarm.networks import ActorCritic
 from jaxswarm.rollout import PolicyFn, Worlds
 from jaxswarm.types import Key, Metrics, is_whole, pytree, require, static
@@ -40,18 +40,12 @@ class Experiment:
     def __post_init__(self) -> None:
         sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every", "reset_pool")
         require(self, "whole numbers from 1", is_whole(1), *sizes)
-        self._check_batch_size()
+        assert self.batch_size
 
-    def _check_batch_size(self) -> None:
-        samples, batch_size = self.agent_steps_per_update, self.learner.batch_size
-        unit = 1 if self.learner.minibatch == "agents" else self.task.num_agents
-        if samples % batch_size or batch_size % unit:
-            divisors = [n for n in range(unit, samples + 1, unit) if samples % n == 0 and n > 1]
-            nearest = sorted(sorted(divisors, key=lambda n: abs(n - batch_size))[:4])
-            raise ValueError(
-                f"batch_size = {batch_size} is not possible; accepted: divisors of num_worlds * num_steps * "
-                f"num_agents = {samples} that are multiples of {unit}, for instance {', '.join(map(str, nearest))}"
-            )
+    @property
+    def batch_size(self) -> int:
+        """Samples per gradient step; raises a `ValueError` where the learner's cannot be."""
+        return batch_size(self.learner, self.agent_steps_per_update, self.task.num_agents)
 
     @property
     def agent_steps_per_update(self) -> int:
@@ -69,6 +63,7 @@ class TrainState:
     worlds: Worlds
 
 
+@jax.jit
 def init(experiment: Experiment, key: Key) -> TrainState:
     """State before the first update."""
     run_key, params_key, obs_key, worlds_key = jax.random.split(key, 4)

@@ -82,6 +82,7 @@ class Observation:
 
     own: Float[Array, "*receivers own_dim"]
     groups: dict[str, Entities]
+    mask: Bool[Array, "*receivers"] | None = None  # agents that exist, the others are to be ignored; None: all do
 
 
 @pytree

@@ -25,8 +25,10 @@ def cases(name):
 
 def aggregator(meta):
     options = meta["agg_mode"]
-    if options["type"] != "Bayesian":
-        return AGGREGATORS["mean"]()
+    if options["type"] == "Mean":
+        return AGGREGATORS[options["actual_mode"]]()
+    if options["type"] == "MultiHeadAttention":
+        return AGGREGATORS["attentive"](num_heads=options["num_heads"], residual=options["residual"])
     return AGGREGATORS["bayesian"](
         prior_mean=PRIOR[options["learnable_mu_z_0"]],
         prior_variance=PRIOR[options["learnable_sigma_z_0"]],
@@ -80,9 +82,13 @@ def params(meta, weights):
 
     width = meta["embedding_dim"] * (2 if meta["agg_mode"].get("output_variance") else 1)
 
-    def prior(prefix):
-        names = {"prior_mean": f"{prefix}.mean_z_0", "prior_variance": f"{prefix}.sigma_z_0_sq"}
-        return {ours: jnp.asarray(weights[theirs]).reshape(-1) for ours, theirs in names.items() if theirs in weights}
+    def pooling(prefix):
+        priors = {"prior_mean": "mean_z_0", "prior_variance": "sigma_z_0_sq"}
+        mha = {"in_kernel": "attention.mha.in_proj_weight", "in_bias": "attention.mha.in_proj_bias"}
+        mha |= {"out_kernel": "attention.mha.out_proj.weight", "out_bias": "attention.mha.out_proj.bias"}
+        names = {ours: f"{prefix}.{theirs}" for ours, theirs in (priors | mha).items()}
+        found = {ours: jnp.asarray(weights[theirs]) for ours, theirs in names.items() if theirs in weights}
+        return {ours: x.T if ours in mha else x.reshape(-1) for ours, x in found.items()}
 
     names = [group["name"] for group in meta["layout"]["sets"]]
 
@@ -99,8 +105,8 @@ def params(meta, weights):
         result["Dense_0"]["kernel"] = in_our_order(result["Dense_0"]["kernel"])
         for name in names:
             result[f"{name}_encoder"] = encoder(f"{prefix}.embedders.{name}.embedding.nn")
-            result[f"{name}_aggregator"] = prior(f"{prefix}.aggregators.{name}")
-        result["groups_aggregator"] = prior(f"{prefix}.aggregator")
+            result[f"{name}_aggregator"] = pooling(f"{prefix}.aggregators.{name}")
+        result["groups_aggregator"] = pooling(f"{prefix}.aggregator")
         return {name: value for name, value in result.items() if value}
 
     tree = {"actor": tower("pi"), "critic": tower("vf"), "log_std": jnp.asarray(weights["log_std"])}

@@ -1,13 +1,20 @@
 """Five tiny tasks whose values and best actions are known; each needs one more part of a learner to work.
 
-They are one task with different numbers, so that one compiled program trains all of them side by side.
+They are one task with different numbers, so that one compiled program trains all of them side by side. So are the
+projections of TRL here.
 """
 
+from functools import cache
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import pytest
 
+import jaxswarm
+from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
+from jaxswarm.learners.projections import PROJECTIONS, Projection
+from jaxswarm.learners.trl import TRL
 from jaxswarm.types import Entities, Observation, Step, pytree, static
 
 
@@ -65,3 +72,64 @@ PROBES = {
     "reward that depends on the action": Probe(action_weight=1.0, target=0.5),
     "reward that depends on both": Probe(action_weight=1.0, cue_target=0.5),
 }
+
+OPTIONS = {"num_epochs": 8, "batch_size": 64, "learning_rate": 3e-3, "discount": 0.5}
+SIZES = {"num_worlds": 64, "num_steps": 2, "eval_worlds": 8, "eval_every": 20}
+NUM_UPDATES = 40
+NETWORK = ActorCritic(encoder=(8,), decoder=(16,), aggregator=AGGREGATORS["mean"](), action_dim=1)
+CASES = [
+    pytest.param((name, projection), marks=pytest.mark.slow if projection else (), id=f"{name}-{projection}")
+    for name in LEARNERS
+    for projection in (PROJECTIONS if name == "trl" else [None])
+]
+
+
+@pytree
+class AnyTRL(TRL):
+    """TRL whose kind of projection is a number."""
+
+    index: int = 0
+
+    @property
+    def layer(self):
+        def function(name):
+            branches = [getattr(projection, name) for projection in PROJECTIONS.values()]
+            return lambda *args: jax.lax.switch(self.index, branches, *args)
+
+        return Projection(*map(function, ("mean_part", "cov_part", "project_std")))
+
+
+@cache
+def _train_all(name):
+    """Of all probes, and for TRL of all projections: parameters before the first and after each update, and returns."""
+    learner = AnyTRL(**OPTIONS) if name == "trl" else LEARNERS[name](**OPTIONS)
+
+    def train(index, task):
+        chosen = learner.replace(index=index) if name == "trl" else learner
+        experiment = Experiment(task, NETWORK, chosen, **SIZES)
+        state = jaxswarm.init(experiment, jax.random.key(0))
+
+        def update(state, _):
+            state, metrics = jaxswarm.train(experiment, state, 1)
+            return state, (state.learner.params, metrics["eval/return"][0])
+
+        params, returns = jax.lax.scan(update, state, length=NUM_UPDATES)[1]
+        return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), state.learner.params, params), returns
+
+    indices = jnp.arange(len(PROJECTIONS) if name == "trl" else 1)
+    tasks = jax.tree.map(lambda *x: jnp.array(x), *PROBES.values())
+    return jax.jit(jax.vmap(jax.vmap(train, (None, 0)), (0, None)))(indices, tasks)
+
+
+def train_probes(name, projection):
+    """By probe: parameters before the first and after each update, and the returns before each."""
+    index = list(PROJECTIONS).index(projection) if projection else 0
+    results = _train_all(name)
+    return {probe: jax.tree.map(lambda x, i=i: x[index, i], results) for i, probe in enumerate(PROBES)}
+
+
+def look(params, cue, time):
+    """Policy and value of the first agent."""
+    obs = next(iter(PROBES.values())).observe(State(jnp.full((2,), cue, jnp.float32), jnp.int32(time)))
+    policy, value = NETWORK.apply(params, obs)
+    return policy[0], value[0]

@@ -1,162 +1,291 @@
-"""What every aggregator promises, over groups of any size; and what each one computes, against closed forms."""
+"""What every aggregator promises, over groups of any size; and what each one computes, against formulas in NumPy."""
+
+import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import linen as nn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxswarm import AGGREGATORS, sets
+from jaxswarm import AGGREGATORS
 from jaxswarm.aggregators import softplus_precision
-from jaxswarm.networks import Encoder
-from jaxswarm.types import Entities
+from jaxswarm.sets import Segments, segments_of
 
-WIDTH, DIM, SLOTS, RECEIVERS = 4, 3, 5, 3
-
-
-class Dense(nn.Module):
-    """An encoder and an aggregator, in the two layouts that must agree."""
-
-    aggregator: nn.Module
-
-    def setup(self):
-        self.encoder = Encoder((6, WIDTH), "tanh", self.aggregator.num_parts)
-        self.reduction = self.aggregator.copy()
-
-    def streamed(self, group):
-        return sets.encode_and_reduce(self.reduction, [self.encoder], [group], WIDTH)
-
-    def by_segments(self, group):
-        messages = jnp.concatenate(self.encoder(group.features.reshape(-1, DIM)), -1)
-        return self.reduction(messages, sets.segments_of(group.mask))
-
-
-MODELS = {name: Dense(aggregator()) for name, aggregator in AGGREGATORS.items()}
-PARAMS = {
-    name: model.init(jax.random.key(3), Entities(jnp.zeros((1, 1, DIM)), jnp.ones((1, 1), bool)), method="streamed")
-    for name, model in MODELS.items()
+WIDTH, SLOTS, RECEIVERS, OWN = 4, 5, 3, 2
+SMALL = {
+    "concat": {"max_entities": 4},
+    "histogram": {"num_distances": 2, "num_bearings": 5, "max_distance": 2.0},
+    "rbf": {"num_distances": 2, "num_bearings": 3, "bearing_width": 0.5},
 }
-STREAMED = {name: jax.jit(lambda p, g, m=model: m.apply(p, g, method="streamed")) for name, model in MODELS.items()}
-LOSS = {
-    name: jax.jit(
-        jax.value_and_grad(
-            lambda p, g, m=model: jnp.square(m.apply(p, g, method="streamed")).sum(), (0, 1), allow_int=True
-        )
-    )
-    for name, model in MODELS.items()
+MODELS = {name: aggregator(**SMALL.get(name, {})) for name, aggregator in AGGREGATORS.items()} | {
+    "bayesian, exp, no prior": AGGREGATORS["bayesian"](rectifier="exp", prior_variance=None, output_variance=True),
+    "bayesian, scalar prior": AGGREGATORS["bayesian"](prior_mean="scalar", prior_variance="scalar"),
+    "bayesian, fixed prior": AGGREGATORS["bayesian"](prior_mean="fixed", prior_variance="fixed"),
+    "attentive, query": AGGREGATORS["attentive"](pooling="query"),
+    "attentive, query, no residual": AGGREGATORS["attentive"](pooling="query", residual=False, num_heads=4),
 }
+LENGTH = {name: model.num_parts * WIDTH for name, model in MODELS.items()}  # of a message
+OWN_FEATURES = np.random.default_rng(5).normal(size=(RECEIVERS, OWN)).astype(np.float32)
+
+
+def segments(mask):
+    return segments_of(jnp.asarray(mask)).replace(own=jnp.asarray(OWN_FEATURES))
+
+
+@functools.cache
+def params_of(name):
+    """Of no special values, as after some training."""
+    rng = np.random.default_rng(3)
+    messages, full = jnp.zeros((RECEIVERS * SLOTS, LENGTH[name])), segments(np.ones((RECEIVERS, SLOTS), bool))
+    params = jax.jit(MODELS[name].init)(jax.random.key(0), messages, full)
+    return jax.tree.map(lambda x: x + jnp.asarray(0.5 * rng.normal(size=x.shape), jnp.float32), params)
+
+
+def output_and_gradients(model):
+    """Of the sum of squares, with respect to the parameters and to the messages."""
+
+    def loss(params, messages, segments):
+        output = model.apply(params, messages, segments)
+        return jnp.square(output).sum(), output
+
+    return jax.jit(jax.grad(loss, (0, 1), has_aux=True))
+
+
+EVALUATE = {name: output_and_gradients(model) for name, model in MODELS.items()}  # to gradients, output
 seeds = st.integers(0, 2**31 - 1)
-every_aggregator = pytest.mark.parametrize("name", AGGREGATORS)
+every_aggregator = pytest.mark.parametrize("name", MODELS)
 
 
-def random_group(seed):
+def random_messages(name, seed):
+    """Messages of groups of any size, from none to all slots, some of them standing there several times."""
     rng = np.random.default_rng(seed)
-    features = rng.normal(size=(RECEIVERS, SLOTS, DIM)).astype(np.float32)
-    mask = rng.random((RECEIVERS, SLOTS)) < rng.random((RECEIVERS, 1))  # from empty to full
-    return Entities(jnp.asarray(features), jnp.asarray(mask)), rng
+    messages = rng.normal(size=(RECEIVERS, SLOTS, LENGTH[name]))
+    messages = messages[:, rng.integers(0, rng.integers(1, SLOTS + 1), SLOTS)]
+    mask = rng.random((RECEIVERS, SLOTS)) < rng.choice([0.0, 0.3, 0.7, 1.0], (RECEIVERS, 1))
+    return messages.astype(np.float32), mask, rng
+
+
+def flat(messages):
+    return jnp.asarray(messages.reshape(-1, messages.shape[-1]), jnp.float32)
+
+
+# ---- formulas: [entities, length] to a vector
+
+
+def softmax(x, axis=-1):
+    e = np.exp(x - x.max(axis, keepdims=True))
+    return e / e.sum(axis, keepdims=True)
+
+
+def softplus(x):
+    return np.logaddexp(0, x)
+
+
+def conditioned_one_by_one(x, model, params):
+    """Posterior of a Gaussian prior after one observation at a time."""
+    rectify = softplus if model.rectifier == "softplus" else np.exp
+    raw = params.get("prior_variance", np.ones(1))
+    variance = np.full(WIDTH, np.inf) if model.prior_variance is None else np.broadcast_to(rectify(raw), WIDTH)
+    mean = np.broadcast_to(params.get("prior_mean", np.ones(1)) if model.prior_variance else 0.0, WIDTH)
+    for observation, noise in zip(x[:, :WIDTH], rectify(x[:, WIDTH:]), strict=True):
+        mean = mean + (observation - mean) / (1 + noise / variance)
+        variance = 1 / (1 / variance + 1 / noise)
+    variance = np.where(np.isinf(variance), 0.0, variance)
+    return np.concatenate([mean, variance]) if model.output_variance else mean
+
+
+def attended(x, model, params, own):
+    if not len(x):
+        return np.zeros(WIDTH)
+    q, k, v = np.split(x @ params["in_kernel"] + params["in_bias"], 3, -1)
+    size = WIDTH // model.num_heads
+    heads = [slice(i * size, (i + 1) * size) for i in range(model.num_heads)]
+    context = [softmax(q[:, h] @ k[:, h].T / np.sqrt(size)) @ v[:, h] for h in heads]
+    y = np.concatenate(context, -1) @ params["out_kernel"] + params["out_bias"] + model.residual * x
+    if model.pooling == "mean":
+        return y.mean(0)
+    query = own @ params["query"]["kernel"] + params["query"]["bias"]
+    return softmax(y @ query / np.sqrt(WIDTH)) @ y
+
+
+def nearest(x, model):
+    """Python sorts tuples by their first entries, then by the next."""
+    rows = sorted(tuple(row) for row in x)[: model.max_entities]
+    return np.array(rows + [(0.0,) * WIDTH] * (model.max_entities - len(rows))).reshape(-1)
+
+
+def histogram(x, model):
+    distance = np.clip(x[:, 0], 0, model.max_distance)
+    angle = np.arctan2(x[:, 2], x[:, 1]) % (2 * np.pi)
+    bins = (model.num_distances, model.num_bearings)
+    counts, _, _ = np.histogram2d(distance, angle, bins, [[0, model.max_distance], [0, 2 * np.pi]])
+    return counts.reshape(-1) / max(len(x), 1)
+
+
+def radial_basis(x, model):
+    distances = np.linspace(0, model.max_distance, model.num_distances)
+    bearings = 2 * np.pi / model.num_bearings * np.arange(model.num_bearings)
+    width = model.distance_width * distances[1], model.bearing_width * bearings[1]
+    radius, angle = np.hypot(x[:, 1], x[:, 2]), np.arctan2(x[:, 2], x[:, 1])
+    values = [
+        np.exp(-((x[:, 0] - d) ** 2) / (2 * width[0] ** 2)) * np.exp((radius * np.cos(angle - b) - 1) / width[1] ** 2)
+        for d, b in itertools.product(distances, bearings)
+    ]
+    return np.array(values).sum(-1) / max(len(x), 1)
+
+
+FORMULAS = {
+    "mean": lambda x, *_: x.mean(0) if len(x) else np.zeros(WIDTH),
+    "max": lambda x, *_: x.max(0) if len(x) else np.zeros(WIDTH),
+    "softmax": lambda x, *_: (softmax(x, 0) * x).sum(0) if len(x) else np.zeros(WIDTH),
+    "bayesian": lambda x, model, params, own: conditioned_one_by_one(x, model, params),
+    "attentive": attended,
+    "concat": lambda x, model, *_: nearest(x, model),
+    "histogram": lambda x, model, *_: histogram(x, model),
+    "rbf": lambda x, model, *_: radial_basis(x, model),
+}
 
 
 @every_aggregator
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds)
-def test_masked_entities_have_no_influence(name, seed):
-    group, rng = random_group(seed)
-    noise = jnp.asarray(rng.normal(size=group.features.shape).astype(np.float32) * 100)
-    other = group.replace(features=jnp.where(group.mask[..., None], group.features, noise))
-    one, (one_params_gradient, one_gradient) = LOSS[name](PARAMS[name], group)
-    two, (two_params_gradient, _) = LOSS[name](PARAMS[name], other)
-    assert one == two
-    jax.tree.map(np.testing.assert_array_equal, one_params_gradient, two_params_gradient)
-    np.testing.assert_array_equal(jnp.where(group.mask[..., None], 0.0, one_gradient.features), 0.0)
+def test_groups_of_any_size_give_what_the_formula_says(name, seed):
+    messages, mask, _ = random_messages(name, seed)
+    if name == "rbf":
+        messages[..., 1:3] /= np.linalg.norm(messages[..., 1:3], axis=-1, keepdims=True)
+    _, result = EVALUATE[name](params_of(name), flat(messages), segments(mask))
+    assert result.dtype == jnp.float32
+    params = jax.tree.map(np.float64, params_of(name).get("params", {}))
+    formula = FORMULAS[name.partition(",")[0]]
+    for row, group, present, own in zip(result, np.float64(messages), mask, OWN_FEATURES, strict=True):
+        np.testing.assert_allclose(row, formula(group[present], MODELS[name], params, own), atol=1e-5, rtol=1e-4)
+
+
+@every_aggregator
+@settings(max_examples=25, deadline=None)
+@given(seed=seeds, scale=st.sampled_from([1.0, 1e4, 1e38]))
+def test_absent_entities_have_no_influence(name, seed, scale):
+    messages, mask, rng = random_messages(name, seed)
+    noise = np.clip(rng.normal(size=messages.shape), -3, 3).astype(np.float32) * np.float32(scale)
+    other = np.where(mask[..., None], messages, noise)
+    one = EVALUATE[name](params_of(name), flat(messages), segments(mask))
+    two = EVALUATE[name](params_of(name), flat(other), segments(mask))
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+    (_, gradient), _ = one
+    np.testing.assert_array_equal(gradient[~mask.reshape(-1)], 0.0)
 
 
 @every_aggregator
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds)
 def test_order_has_no_influence(name, seed):
-    group, rng = random_group(seed)
-    order = rng.permutation(SLOTS)
-    other = Entities(group.features[:, order], group.mask[:, order])
-    np.testing.assert_allclose(STREAMED[name](PARAMS[name], group), STREAMED[name](PARAMS[name], other), atol=2e-6)
+    _, mask, rng = random_messages(name, seed)
+    messages = rng.normal(size=(RECEIVERS, SLOTS, LENGTH[name]))
+    order = rng.permutation(RECEIVERS * SLOTS)  # also across receivers
+    regular = segments(mask)
+    shuffled = regular.replace(receiver=regular.receiver[order], is_present=regular.is_present[order])
+    (_, one_gradient), one = EVALUATE[name](params_of(name), flat(messages), regular)
+    (_, two_gradient), two = EVALUATE[name](params_of(name), flat(messages)[order], shuffled)
+    np.testing.assert_allclose(two, one, atol=2e-6, rtol=1e-5)
+    np.testing.assert_allclose(two_gradient, one_gradient[order], atol=2e-5, rtol=1e-4)
 
 
 @every_aggregator
-@settings(max_examples=25, deadline=None)
-@given(seed=seeds)
-def test_layouts_agree(name, seed):
-    group, _ = random_group(seed)
-    by_segments = MODELS[name].apply(PARAMS[name], group, method="by_segments")
-    np.testing.assert_allclose(STREAMED[name](PARAMS[name], group), by_segments, atol=2e-6, rtol=1e-5)
+@pytest.mark.parametrize("nobody", [-(2**31), -1, RECEIVERS, 2**31 - 1])
+def test_messages_to_receivers_that_do_not_exist_are_absent(name, nobody):
+    messages, mask, _ = random_messages(name, 2)
+    regular = segments(mask)
+    receiver = jnp.where(regular.is_present, regular.receiver, nobody)
+    other = regular.replace(receiver=receiver, is_present=jnp.ones_like(regular.is_present))
+    one, two = (EVALUATE[name](params_of(name), flat(messages), x) for x in (regular, other))
+    jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
 @every_aggregator
-def test_segments_may_come_in_any_order(name):
-    group, rng = random_group(7)
-    model = AGGREGATORS[name]()
-    segments = sets.segments_of(group.mask)
-    messages = jnp.asarray(rng.normal(size=(RECEIVERS * SLOTS, model.num_parts * WIDTH)), jnp.float32)
-    order = rng.permutation(RECEIVERS * SLOTS)
-    shuffled = segments.replace(receiver=segments.receiver[order], is_present=segments.is_present[order])
-    params = model.init(jax.random.key(0), messages, segments)
-    one = model.apply(params, messages, segments)
-    np.testing.assert_allclose(model.apply(params, messages[order], shuffled), one, atol=1e-6)
+def test_gradients_are_those_of_the_output(name):
+    _, mask, rng = random_messages(name, 11)
+    mask[0], mask[1, 0] = True, True
+    messages, direction = rng.normal(size=(2, RECEIVERS * SLOTS, LENGTH[name]))
+    (_, gradient), _ = EVALUATE[name](params_of(name), flat(messages), segments(mask))
+    outputs = [
+        np.float64(EVALUATE[name](params_of(name), flat(messages + step * direction), segments(mask))[1])
+        for step in (-1e-3, 1e-3)
+    ]
+    numeric = (np.square(outputs[1]).sum() - np.square(outputs[0]).sum()) / 2e-3
+    assert (gradient * direction).sum() == pytest.approx(numeric, rel=5e-3, abs=2e-3)
 
 
 @every_aggregator
-def test_empty_groups_give_finite_output_and_gradient(name):
-    group, _ = random_group(1)
-    empty = group.replace(mask=jnp.zeros_like(group.mask))
-    loss, (params_gradient, gradient) = LOSS[name](PARAMS[name], empty)
-    for leaf in jax.tree.leaves((loss, params_gradient, gradient.features)):
+@pytest.mark.parametrize("num_slots", [0, SLOTS])
+def test_empty_groups_give_finite_output_and_gradient(name, num_slots):
+    messages = jnp.ones((RECEIVERS * num_slots, LENGTH[name]))
+    empty = segments(np.zeros((RECEIVERS, num_slots), bool))
+    for leaf in jax.tree.leaves(EVALUATE[name](params_of(name), messages, empty)):
         assert np.isfinite(leaf).all()
 
 
 @every_aggregator
-def test_a_group_without_slots_is_an_empty_group(name):
-    group, _ = random_group(1)
-    empty = group.replace(mask=jnp.zeros_like(group.mask))
-    none = Entities(jnp.zeros((RECEIVERS, 0, DIM)), jnp.zeros((RECEIVERS, 0), bool))
-    np.testing.assert_array_equal(STREAMED[name](PARAMS[name], none), STREAMED[name](PARAMS[name], empty))
+def test_no_receivers_give_no_vectors(name):
+    none = segments_of(jnp.zeros((0, SLOTS), bool)).replace(own=jnp.zeros((0, OWN)))
+    assert MODELS[name].apply(params_of(name), jnp.zeros((0, LENGTH[name])), none).shape[0] == 0
 
 
-def test_mean_is_the_mean_of_those_present():
-    messages = jnp.arange(12.0).reshape(6, 2)
-    segments = sets.Segments(jnp.array([0, 0, 1, 1, 1, 2]), jnp.array([True, True, True, False, True, False]), 3)
-    result = AGGREGATORS["mean"]().apply({}, messages, segments)
-    np.testing.assert_allclose(result, [[1.0, 2.0], [6.0, 7.0], [0.0, 0.0]])
+def test_softmax_of_large_messages_is_finite_and_exact():
+    messages = jnp.array([[1e30, 300.0, -300.0], [2e30, 301.0, -301.0], [-3e38, -1e30, -1e30]])
+    one = segments_of(jnp.ones((1, 3), bool))
+    share = 1 / (1 + np.exp(-1.0))
+    result = AGGREGATORS["softmax"]().apply({}, messages, one)
+    np.testing.assert_allclose(result, [[2e30, 300 + share, -301 + share]], rtol=1e-6)
 
 
-def conditioned_one_by_one(observations, variances, mean, variance):
-    """Posterior of a Gaussian prior after one observation at a time."""
-    for observation, noise in zip(observations, variances, strict=True):
-        gain = variance / (variance + noise)
-        mean, variance = mean + gain * (observation - mean), (1 - gain) * variance
-    return mean, variance
+def test_query_pooling_needs_what_receivers_know():
+    with pytest.raises(ValueError, match=r"own = None is not possible with pooling = 'query'"):
+        jax.eval_shape(
+            MODELS["attentive, query"].init, jax.random.key(0), jnp.ones((2, 4)), segments_of(jnp.ones((1, 2), bool))
+        )
 
 
-@pytest.mark.parametrize("rectifier", ["softplus", "exp"])
-def test_bayesian_is_conditioning_on_one_observation_after_the_other(rectifier):
-    rng = np.random.default_rng(0)
-    messages = rng.normal(size=(5, 6))
-    rectify = (lambda x: np.log1p(np.exp(x))) if rectifier == "softplus" else np.exp
-    mean, variance = conditioned_one_by_one(messages[:, :3], rectify(messages[:, 3:]), np.full(3, 0.3), rectify(-0.2))
-    model = AGGREGATORS["bayesian"](rectifier=rectifier, output_variance=True)
-    params = {"params": {"prior_mean": jnp.full(3, 0.3), "prior_variance": jnp.full(3, -0.2)}}
-    segments = sets.segments_of(jnp.ones((1, 5), bool))
-    result = model.apply(params, jnp.asarray(messages, jnp.float32), segments)
-    np.testing.assert_allclose(result[0], np.concatenate([mean, variance]), rtol=1e-5)
+def test_a_histogram_counts_entities_on_the_border_once():
+    angle = np.linspace(-np.pi, np.pi, 81)
+    features = np.stack([np.tile([0.0, 0.5, 1.0], 27), np.cos(angle), np.sin(angle)], -1)
+    features = np.concatenate([features, np.zeros((3, 3))])  # at no distance, without a bearing
+    model = AGGREGATORS["histogram"](num_distances=4, num_bearings=8)
+    result = model.apply({}, jnp.asarray(features, jnp.float32), Segments(jnp.arange(84), jnp.ones(84, bool), 84))
+    np.testing.assert_array_equal(result.sum(-1), 1.0)
+    np.testing.assert_array_equal(result[-1].reshape(4, 8)[0, 0], 1.0)
 
 
-def test_bayesian_without_evidence_is_the_prior():
-    segments = sets.segments_of(jnp.zeros((1, 2), bool))
-    params = {"params": {"prior_mean": jnp.full(3, 0.3), "prior_variance": jnp.zeros(3)}}
-    model = AGGREGATORS["bayesian"](output_variance=True)
-    result = model.apply(params, jnp.ones((2, 6)), segments)
-    np.testing.assert_allclose(result[0], [0.3] * 3 + [np.log(2)] * 3, rtol=1e-6)
-    no_prior = AGGREGATORS["bayesian"](prior_mean=None, prior_variance=None)
-    np.testing.assert_array_equal(no_prior.apply({}, jnp.ones((2, 6)), segments), 0.0)
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("bayesian", {"rectifier": "relu"}, r"rectifier = 'relu' is not possible; accepted: softplus, exp"),
+        ("bayesian", {"prior_mean": "vector"}, r"prior_mean = 'vector' .* feature, scalar, fixed, None"),
+        ("bayesian", {"variance_encoder": True}, r"variance_encoder = True .* shared, separate"),
+        ("attentive", {"num_heads": 0}, r"num_heads = 0 .* whole numbers from 1"),
+        ("attentive", {"pooling": "max"}, r"pooling = 'max' .* mean, query"),
+        ("concat", {"max_entities": -1}, r"max_entities = -1 .* whole numbers from 1"),
+        ("histogram", {"num_bearings": 2}, r"num_bearings = 2 .* whole numbers from 3"),
+        ("histogram", {"max_distance": 0.0}, r"max_distance = 0.0 .* positive numbers"),
+        ("rbf", {"num_distances": 1}, r"num_distances = 1 .* whole numbers from 2"),
+        ("rbf", {"bearing_width": -1.0}, r"bearing_width = -1.0 .* positive numbers"),
+    ],
+)
+def test_impossible_options_are_named(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        AGGREGATORS[name](**options)
+
+
+def test_heads_divide_the_features():
+    with pytest.raises(ValueError, match=r"num_heads = 3 is not possible; accepted: divisors of 4"):
+        AGGREGATORS["attentive"](num_heads=3).init(jax.random.key(0), jnp.ones((6, 4)), segments(np.ones((3, 2), bool)))
+
+
+def test_raw_features_have_a_distance_and_a_bearing():
+    with pytest.raises(ValueError, match=r"2 features are not possible"):
+        AGGREGATORS["histogram"]().apply({}, jnp.ones((2, 2)), segments_of(jnp.ones((1, 2), bool)))
 
 
 def test_precision_of_softplus_and_its_gradient_over_the_whole_range():

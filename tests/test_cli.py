@@ -117,7 +117,7 @@ def test_help_shows_groups_choices_and_keys(capsys):
     out = capsys.readouterr().out
     assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_worlds: 32", "resume=PATH"))
     assert cli.evaluate(["-h"]) == 0
-    assert "task.num_agents=50" in capsys.readouterr().out
+    assert "task.num_agents=5,10" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", [[], ["checkpoint=last", "task.num_agents=7", "episodes=3"]])
@@ -126,9 +126,22 @@ def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, words):
     out = capsys.readouterr().out
     path = out.splitlines()[-1].removeprefix("wrote ")
     result = json.loads(Path(path).read_text())
-    assert result["task"]["num_agents"] == (7 if words else 3)
+    (played,) = result["results"]
+    assert played["task"]["num_agents"] == (7 if words else 3)
     assert result["episodes"] == (3 if words else 2)
-    assert f"{result['metrics']['return']:.4f}" in out
+    assert f"{played['metrics']['return']:.4f}" in out
+
+
+def test_a_policy_is_evaluated_in_swarms_of_several_sizes(finished, capsys):
+    assert cli.evaluate([str(finished), "task.num_agents=2,5", "task.torus=true,false"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    results = json.loads(Path(lines[-1].removeprefix("wrote ")).read_text())["results"]
+    assert [result["task"]["num_agents"] for result in results] == [2, 2, 5, 5]
+    table = {line.split()[0]: line.split()[1:] for line in lines[1:-1]}
+    assert table["task.num_agents"] == ["2", "2", "5", "5"]
+    assert table["task.torus"] == ["True", "False", "True", "False"]
+    assert table["return"] == [f"{result['metrics']['return']:.4f}" for result in results]
+    assert len(set(table["return"])) == 4
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,13 @@ def test_words_reach_the_experiment():
     assert isinstance(experiment.task.side, float)  # an integer leaf would be another program
 
 
+def test_a_field_needs_no_prefix_where_only_one_part_has_it():
+    words = ["learner=trl", "projection=kl", "mean_bound=0.03", "cov_bound=0.001", "coefficient=8", "num_agents=7"]
+    config = configs.compose(words)
+    assert config == configs.compose([f"learner.{word}" if i in (1, 2, 3, 4) else word for i, word in enumerate(words)])
+    assert (config["learner"]["projection"], config["task"]["num_agents"]) == ("kl", 7)
+
+
 def test_the_thesis_setting_has_the_thesis_arithmetic():
     config = configs.compose(["experiment=rendezvous_thesis"])
     experiment = configs.build(config)
@@ -43,6 +50,16 @@ def test_the_thesis_setting_has_the_thesis_arithmetic():
     assert per_update // learner.batch_size * learner.num_epochs == 1640
     assert (learner.learning_rate, learner.adam_epsilon, learner.bootstrap_truncation) == (3e-4, 1e-5, False)
     assert experiment.task.relative_velocity == "thesis"
+
+
+def test_trust_region_layers_are_configured_by_words():
+    words = ["learner=trl", "learner.projection=kl", "learner.mean_bound=0.05", "learner.coefficient=8"]
+    experiment = configs.build(configs.compose([*words, "network.std=state"]))
+    learner = experiment.learner
+    assert (learner.projection, learner.mean_bound, learner.cov_bound, learner.coefficient) == ("kl", 0.05, 1e-3, 8.0)
+    assert experiment.network.std == "state"
+    experiment = configs.build(configs.compose(["experiment=rendezvous_thesis", "learner=trl_thesis"]))
+    assert (experiment.learner.objective, experiment.learner.projection) == ("raw", "wasserstein")
 
 
 def test_words_win_over_an_experiment():
@@ -74,10 +91,12 @@ def test_fields_that_no_file_mentions_get_their_defaults():
     [
         ("taks=rendezvous", ["'taks'", "did you mean 'task'"]),
         ("num_world=3", ["did you mean 'num_worlds'", "num_steps"]),
-        ("learning_rate=3", ["did you mean 'learner.learning_rate'"]),
+        ("learning_rat=3", ["did you mean 'learner.learning_rate'"]),
+        ("learning_rate=fast", ["learner.learning_rate = 'fast'"]),
+        ("name=ppo", ["name is a field of task and aggregator and learner", "learner.name"]),
         ("learner.learning_rat=3", ["did you mean 'learner.learning_rate'", "learner.clip_range"]),
         ("seed.x=3", ["'seed.x'"]),
-        ("task=rendevous", ["did you mean 'rendezvous'", "accepted: assembly, clustering_2, clustering_3, rendezvous"]),
+        ("task=rendevous", ["did you mean 'rendezvous'", ", rendezvous"]),
         ("learner=x", ["'x'", "accepted: ppo, ppo_thesis"]),
         ("task.name=x", ["task.name", "'x'", "rendezvous"]),
         ("learner.learning_rate=fast", ["learner.learning_rate", "'fast'", "a number"]),
@@ -86,6 +105,8 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("num_worlds=true", ["True", "an integer"]),
         ("total_agent_steps=1e6", ["an integer", "write 1000000"]),
         ("task.torus=1", ["task.torus", "true, false"]),
+        ("learner=trl_thesi", ["did you mean 'trl_thesis'", "ppo_thesis"]),
+        ("network.std=none", ["'none'", "shared, state"]),
         ("network.activation=gelu", ["'gelu'", "leaky_relu, relu, tanh"]),
         ("network.encoder=64", ["64", "a list of integers"]),
         ("network.encoder=[a]", ["network.encoder[0]", "an integer"]),

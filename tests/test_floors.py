@@ -13,13 +13,14 @@ PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types"},
     {"geometry", "contacts", "sets", "distributions"},
-    {"dynamics", "shapes", "aggregators"},
-    {"rigid2d"},
-    {"tasks.rendezvous", "tasks.boxes", "networks"},
+    {"dynamics", "neighbors", "shapes", "aggregators"},
+    {"rigid2d", "tasks.swarm", "tasks.evasion", "networks"},
+    {"tasks.rendezvous", "tasks.pursuit", "tasks.boxes"},
     {"tasks"},
     {"rollout"},
     {"learners.on_policy"},
-    {"learners.ppo"},
+    {"learners.projections"},
+    {"learners.ppo", "learners.trl"},
     {"learners"},
     {"training"},
     {"config", "checkpoint"},
@@ -29,7 +30,7 @@ FLOORS = [
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
 WINGS = (
-    {"geometry", "contacts", "dynamics", "shapes", "rigid2d", "tasks"},
+    {"geometry", "dynamics", "neighbors", "contacts", "shapes", "rigid2d", "tasks"},
     {"sets", "distributions", "aggregators", "networks"},
 )
 MODULES = {

@@ -1,5 +1,7 @@
 """Networks reproduce recorded outputs, have the documented sizes and initial weights."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,13 +16,27 @@ ARCHITECTURES = {
     "simple": {"encoder": (64,), "decoder": (64,)},
     "medium": {"encoder": (120, 60), "decoder": (160,)},
     "optimised": {"encoder": (146, 120), "decoder": (19, 177, 162), "activation": "tanh"},
+    "attentive": {"encoder": (72,), "decoder": (132, 200)},
+    "single space": {"encoder": (120, 60), "decoder": (160,), "latent_space": "shared"},
 }
 
 
-def rendezvous_like(num_rows=1, num_slots=3):
-    features = jax.random.normal(jax.random.key(1), (num_rows, num_slots, 8))
-    group = Entities(features, jnp.ones((num_rows, num_slots), bool))
-    return Observation(jax.random.normal(jax.random.key(2), (num_rows, 3)), {"neighbors": group})
+def random_observation(num_rows=1, own=3, **groups):
+    """Groups of 3 entities with so many features each."""
+
+    def entities(i, dim):
+        return Entities(jax.random.normal(jax.random.key(i), (num_rows, 3, dim)), jnp.ones((num_rows, 3), bool))
+
+    own = jax.random.normal(jax.random.key(99), (num_rows, own))
+    return Observation(own, {name: entities(i, dim) for i, (name, dim) in enumerate(groups.items())})
+
+
+def rendezvous_like(num_rows=1):
+    return random_observation(num_rows, neighbors=8)
+
+
+def pursuit_like(num_rows=1):
+    return random_observation(num_rows, own=1, neighbors=5, evaders=3)
 
 
 @pytest.mark.parametrize(
@@ -47,25 +63,29 @@ def test_outputs_of_recorded_weights(meta, arrays):
 
 
 @pytest.mark.parametrize(
-    ("architecture", "aggregator", "count"),
+    ("architecture", "observation", "aggregator", "options", "count"),
     [
-        ("simple", "mean", 10_053),
-        ("simple", "bayesian", 11_461),
-        ("medium", "mean", 37_645),
-        ("medium", "bayesian", 52_405),
-        ("optimised", "mean", 107_863),
-        ("optimised", "bayesian", 143_623),
+        ("simple", rendezvous_like, "mean", {}, 10_053),
+        ("simple", rendezvous_like, "bayesian", {}, 11_461),
+        ("medium", rendezvous_like, "mean", {}, 37_645),
+        ("medium", rendezvous_like, "bayesian", {}, 52_405),
+        ("optimised", rendezvous_like, "mean", {}, 107_863),
+        ("optimised", rendezvous_like, "bayesian", {}, 143_623),
+        ("medium", pursuit_like, "max", {}, 70_965),
+        ("medium", pursuit_like, "bayesian", {"output_variance": True}, 138_885),
+        ("single space", pursuit_like, "bayesian", {}, 81_045),
+        ("attentive", pursuit_like, "attentive", {}, 177_885),
     ],
 )
-def test_parameter_counts_of_the_thesis(architecture, aggregator, count):
-    model = ActorCritic(**ARCHITECTURES[architecture], aggregator=AGGREGATORS[aggregator]())
-    tree = jax.eval_shape(model.init, jax.random.key(0), rendezvous_like())
+def test_parameter_counts_of_the_thesis(architecture, observation, aggregator, options, count):
+    model = ActorCritic(**ARCHITECTURES[architecture], aggregator=AGGREGATORS[aggregator](**options))
+    tree = jax.eval_shape(model.init, jax.random.key(0), observation())
     assert sum(x.size for x in jax.tree.leaves(tree)) == count
 
 
 def test_initial_weights_are_orthogonal_with_the_documented_gains():
     model = ActorCritic(encoder=(8, 6), decoder=(5,), aggregator=AGGREGATORS["bayesian"]())
-    tree = model.init(jax.random.key(0), rendezvous_like())["params"]
+    tree = jax.jit(model.init)(jax.random.key(0), rendezvous_like())["params"]
 
     def gain(kernel):
         singular_values = np.linalg.svd(kernel, compute_uv=False)
@@ -85,10 +105,97 @@ def test_initial_weights_are_orthogonal_with_the_documented_gains():
     assert not np.allclose(tree["actor"]["Dense_0"]["kernel"], tree["critic"]["Dense_0"]["kernel"])
 
 
+def test_initial_weights_of_attention_are_those_of_the_thesis():
+    model = ActorCritic(encoder=(72,), decoder=(5,), aggregator=AGGREGATORS["attentive"]())
+    tree = jax.jit(model.init)(jax.random.key(0), rendezvous_like())["params"]
+    for tower in ("actor", "critic"):
+        weights = tree[tower]["neighbors_aggregator"]
+        bound = np.sqrt(6 / (4 * 72))  # Xavier's, of a matrix from 72 to 3 * 72
+        assert 0.99 * bound < np.abs(weights["in_kernel"]).max() <= bound
+        assert np.std(weights["in_kernel"]) == pytest.approx(bound / np.sqrt(3), rel=0.02)
+        np.testing.assert_allclose(np.linalg.svd(weights["out_kernel"], compute_uv=False), np.sqrt(2), rtol=1e-4)
+        for bias in ("in_bias", "out_bias"):
+            np.testing.assert_array_equal(weights[bias], 0.0)
+
+
+def assert_same_outputs(one, one_tree, two, two_tree, obs):
+    values = (
+        jax.jit(partial(model.apply, method="value"))({"params": x}, obs)
+        for model, x in ((one, one_tree), (two, two_tree))
+    )
+    np.testing.assert_allclose(*values, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_separate_encoders_of_the_same_weights_are_a_shared_one():
+    obs = pursuit_like(num_rows=4)
+    shared, separate = (
+        ActorCritic((4,), decoder=(5,), aggregator=AGGREGATORS["bayesian"](variance_encoder=kind))
+        for kind in ("shared", "separate")
+    )
+    tree = jax.jit(shared.init)(jax.random.key(0), obs)["params"]
+
+    def split(tower):
+        halves = {}
+        for name in obs.groups:
+            for suffix, part in (("", slice(4)), ("_1", slice(4, 8))):
+                halves[f"{name}_encoder{suffix}"] = {k: x[..., part] for k, x in tower[f"{name}_encoder"].items()}
+        return tower | halves
+
+    split_tree = tree | {name: split(tree[name]) for name in ("actor", "critic")}
+    expected = jax.eval_shape(separate.init, jax.random.key(0), obs)["params"]
+    assert jax.tree.map(jnp.shape, split_tree) == jax.tree.map(jnp.shape, expected)
+    assert_same_outputs(shared, tree, separate, split_tree, obs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variance_encoder", ["shared", "separate"])
+def test_a_second_stage_is_further_layers_that_all_groups_share(variance_encoder):
+    options = {"decoder": (5,), "aggregator": AGGREGATORS["bayesian"](variance_encoder=variance_encoder)}
+    one_stage, two_stages = ActorCritic((6, 4), **options), ActorCritic((6,), shared_encoder=(4,), **options)
+    obs = pursuit_like(num_rows=4)
+    tree = jax.jit(two_stages.init)(jax.random.key(0), obs)["params"]
+
+    def merge(tower):
+        tower, numbers = dict(tower), ["", "_1"][: options["aggregator"].num_encoders]
+        last = {number: tower.pop(f"second_stage{number}") for number in numbers}
+        first = {f"{name}_encoder{number}": number for name in obs.groups for number in numbers}
+        return tower | {name: {"Dense_0": tower[name]} | last[number] for name, number in first.items()}
+
+    merged = tree | {name: merge(tree[name]) for name in ("actor", "critic")}
+    expected = jax.eval_shape(one_stage.init, jax.random.key(0), obs)["params"]
+    assert jax.tree.map(jnp.shape, merged) == jax.tree.map(jnp.shape, expected)
+    assert_same_outputs(two_stages, tree, one_stage, merged, obs)
+
+
+@pytest.mark.parametrize("name", AGGREGATORS)
+def test_every_aggregator_makes_a_network(name):
+    model = ActorCritic((4,), decoder=(5,), aggregator=AGGREGATORS[name]())
+    obs = pursuit_like(num_rows=2)
+    tree = jax.eval_shape(model.init, jax.random.key(0), obs)
+    assert jax.eval_shape(model.apply, tree, obs)[1].shape == (2,)
+    is_encoded = any("encoder" in key for key in tree["params"]["actor"])
+    assert is_encoded == (AGGREGATORS[name]().num_encoders > 0)
+
+
+def test_pooling_by_a_query_gets_what_agents_know_of_themselves():
+    model = ActorCritic((4,), decoder=(5,), aggregator=AGGREGATORS["attentive"](pooling="query"))
+    tree = jax.eval_shape(model.init, jax.random.key(0), rendezvous_like())["params"]["actor"]
+    assert tree["neighbors_aggregator"]["query"]["kernel"].shape == (3, 4)
+
+
+@pytest.mark.parametrize("name", [name for name, x in AGGREGATORS.items() if x().num_encoders == 0])
+def test_features_of_several_groups_cannot_be_aggregated_together(name):
+    model = ActorCritic(aggregator=AGGREGATORS[name](), latent_space="shared")
+    with pytest.raises(ValueError, match="latent_space = 'shared' is not possible for evaders, neighbors: "):
+        jax.eval_shape(model.init, jax.random.key(0), pursuit_like())
+    jax.eval_shape(model.init, jax.random.key(0), rendezvous_like())
+
+
 def test_leading_axes_are_free():
     model = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"]())
     obs = rendezvous_like(num_rows=6)
-    tree = model.init(jax.random.key(0), obs)
+    tree = jax.jit(model.init)(jax.random.key(0), obs)
     policy, value = model.apply(tree, obs)
     reshaped = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), obs)
     other_policy, other_value = model.apply(tree, reshaped)
@@ -101,3 +208,18 @@ def test_equal_networks_are_equal_as_compilation_keys():
     assert one == two
     assert hash(one) == hash(two)
     assert one != ActorCritic(aggregator=AGGREGATORS["bayesian"]())
+
+
+def test_a_standard_deviation_of_the_state_starts_near_1_and_differs_between_states():
+    model = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"](), std="state")
+    obs = rendezvous_like(num_rows=6)
+    tree = jax.jit(model.init)(jax.random.key(0), obs)
+    assert "log_std" not in tree["params"]
+    std = np.asarray(model.apply(tree, obs, method="policy").stddev())
+    assert std.shape == (6, 2)
+    assert 0 < np.abs(std - 1).max() < 0.1
+    assert (std.std(0) > 0).all()
+    shared = ActorCritic(encoder=(8,), decoder=(5,), aggregator=AGGREGATORS["mean"]())
+    assert (
+        np.asarray(shared.apply(jax.jit(shared.init)(jax.random.key(0), obs), obs, method="policy").stddev()) == 1
+    ).all()

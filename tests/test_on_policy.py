@@ -1,5 +1,7 @@
 """Advantages against their definition, values across resets, and the shuffling of samples."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from probes import PROBES
 
-from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, rollout
+from jaxswarm import AGGREGATORS, LEARNERS, TASKS, ActorCritic, rollout
 from jaxswarm.learners import on_policy
 
 
@@ -59,13 +61,20 @@ def test_every_sample_is_as_likely_in_every_minibatch(rows, columns):
     assert np.abs(together - (columns - 1) / (rows * columns - 1)).max() < 5 / np.sqrt(rows * num_draws)
 
 
-def random_trajectory(task, num_steps=6, num_worlds=3):
-    network = ActorCritic(encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["mean"](), action_dim=1)
-    params = network.init(jax.random.key(0), task.observe(task.reset(jax.random.key(0))))
-    worlds = rollout.start(jax.random.key(1), task, num_worlds, is_desynchronised=False)
-    policy = lambda obs: network.apply(params, obs, method="policy")  # noqa: E731
-    _, trajectory, metrics = rollout.collect(jax.random.key(2), task, policy, worlds, num_steps, reset_pool=2)
-    return network, params, trajectory, metrics
+def random_trajectory(task, num_steps=6, num_worlds=3, std="shared"):
+    network = ActorCritic(
+        encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["mean"](), std=std, action_dim=task.action_dim
+    )
+
+    @jax.jit
+    def play():
+        params = network.init(jax.random.key(0), task.observe(task.reset(jax.random.key(0))))
+        worlds = rollout.start(jax.random.key(1), task, num_worlds, is_desynchronised=False)
+        policy = partial(network.apply, params, method="policy")
+        _, trajectory, metrics = rollout.collect(jax.random.key(2), task, policy, worlds, num_steps, reset_pool=2)
+        return params, trajectory, metrics
+
+    return network, *play()
 
 
 def test_values_after_a_step_are_those_of_the_state_before_any_reset():
@@ -93,6 +102,56 @@ def test_fetched_samples_are_those_of_the_trajectory():
     batch = on_policy.fetch_worlds(task, samples, jnp.array([7, 2]))
     np.testing.assert_array_equal(batch.target, [-14, -15, -4, -5])
     np.testing.assert_allclose(batch.obs.groups["neighbors"].features[1, 0], obs.own[2, 1, 0])
+
+
+@pytest.mark.parametrize(("name", "std"), [("ppo", "shared"), pytest.param("trl", "state", marks=pytest.mark.slow)])
+def test_agents_that_do_not_exist_have_no_influence_on_an_update(name, std):
+    task = TASKS["rendezvous"](num_agents=4, active_agents=(2, 3), episode_length=4)
+    network, params, trajectory, _ = random_trajectory(task, std=std)
+    learner = LEARNERS[name](batch_size=36, num_epochs=1)
+    is_absent = jnp.arange(4)[None, None] >= trajectory.state.active_agents[..., None]
+    assert is_absent.any()
+
+    def garble(x):
+        return jnp.where(is_absent.reshape(*is_absent.shape, *[1] * (x.ndim - 3)), 7.0 + x, x)
+
+    def garbled(state):
+        return state.replace(position=garble(state.position), heading=garble(state.heading))
+
+    names = ("action", "log_prob", "action_mean", "action_std")
+    other = trajectory.replace(**{field: garble(getattr(trajectory, field)) for field in names})
+    other = other.replace(state=garbled(trajectory.state), final_state=garbled(trajectory.final_state))
+    update = jax.jit(lambda x: learner.update(jax.random.key(0), learner.init(params), network, task, x))
+    (state, metrics), (other_state, other_metrics) = update(trajectory), update(other)
+    jax.tree.map(np.testing.assert_array_equal, state.params, other_state.params)
+    jax.tree.map(np.testing.assert_array_equal, metrics, other_metrics)
+    assert all(np.isfinite(metric) for metric in metrics.values())
+    (changed, _) = update(trajectory.replace(action=trajectory.action + 0.1))
+    assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (state.params, changed.params)), strict=True))
+
+
+def test_statistics_are_those_of_the_rows_that_exist():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(2, 20)).astype(np.float32)
+    mask = rng.random(20) < 0.5
+    kept, kept_y = x[mask], y[mask]
+    expected = (kept - kept.mean()) / kept.std(ddof=1)
+    np.testing.assert_allclose(on_policy.standardised(jnp.array(x), jnp.array(mask))[mask], expected, atol=1e-5)
+    np.testing.assert_allclose(on_policy.mean(jnp.array(x), jnp.array(mask)), kept.mean(), atol=1e-6)
+    np.testing.assert_allclose(on_policy.maximum(jnp.array(x**2), jnp.array(mask)), (kept**2).max())
+    explained = on_policy.explained_variance(jnp.array(x), jnp.array(y), jnp.array(mask))
+    np.testing.assert_allclose(explained, 1 - (kept_y - kept).var() / kept_y.var(), rtol=1e-5)
+    everywhere = np.ones(20, bool)
+    for function in (on_policy.standardised, on_policy.mean):
+        np.testing.assert_allclose(
+            function(jnp.array(x), None), function(jnp.array(x), jnp.array(everywhere)), atol=1e-6
+        )
+
+
+@pytest.mark.parametrize(("num_agents", "batch_size"), [(20, 1280), (10, 1280), (50, 1600), (7, 896), (3000, 3000)])
+def test_the_batch_size_nearest_to_the_usual_one_is_chosen(num_agents, batch_size):
+    learner = LEARNERS["ppo"]()
+    assert on_policy.batch_size(learner, 32 * 128 * num_agents, num_agents) == batch_size
 
 
 @pytest.mark.parametrize("learner", LEARNERS)

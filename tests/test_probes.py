@@ -1,41 +1,29 @@
-"""Every learner finds the known values and best actions of the probe tasks."""
+"""Every learner finds the known values and best actions of the probe tasks; trust regions bound its updates."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import PROBES, State
+from probes import CASES, OPTIONS, PROBES, look, train_probes
+from test_projections import cov_distance, mean_distance
 
-import jaxswarm
-from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
-
-OPTIONS = {"num_epochs": 8, "batch_size": 64, "learning_rate": 3e-3, "discount": 0.5}
-NETWORK = ActorCritic(encoder=(8,), decoder=(16,), aggregator=AGGREGATORS["mean"](), action_dim=1)
+from jaxswarm import LEARNERS
+from jaxswarm.learners.projections import PROJECTIONS
 
 
-@pytest.fixture(scope="module", params=LEARNERS)
+@pytest.fixture(scope="module", params=CASES)
 def outputs(request):
     """Action and value by (probe, cue, time) after training all probes side by side."""
-    learner = LEARNERS[request.param](**OPTIONS)
-    sizes = {"num_worlds": 64, "num_steps": 2, "eval_worlds": 8, "eval_every": 20}
-
-    def train(task):
-        experiment = Experiment(task, NETWORK, learner, **sizes)
-        state, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 40)
-        return state.learner.params, metrics["eval/return"]
-
-    tasks = jax.tree.map(lambda *x: jnp.array(x), *PROBES.values())
-    params, returns = jax.jit(jax.vmap(train))(tasks)
-
-    def look(params, cue, time):
-        policy, value = NETWORK.apply(params, next(iter(PROBES.values())).observe(State(jnp.full((2,), cue), time)))
-        return policy.mean()[0, 0], value[0]
+    results = train_probes(*request.param)
 
     def output(probe, cue, time):
-        one = jax.tree.map(lambda x: x[list(PROBES).index(probe)], params)
-        return [float(x) for x in look(one, float(cue), jnp.int32(time))]
+        params = jax.tree.map(lambda x: x[-1], results[probe][0])
+        policy, value = look(params, cue, time)
+        return float(policy.mean()[0]), float(value)
 
-    output.returns = dict(zip(PROBES, np.asarray(returns), strict=True))
+    output.returns = {probe: returns for probe, (_, returns) in results.items()}
     return output
 
 
@@ -62,3 +50,28 @@ def test_best_action(outputs):
 @pytest.mark.parametrize("cue", [-1, 1])
 def test_best_action_that_depends_on_the_observation(outputs, cue):
     assert outputs("reward that depends on both", cue, 0)[0] == pytest.approx(cue / 2, abs=0.15)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+@partial(jax.vmap, in_axes=(0, None, None))
+def mean_and_std(params, cue, time):
+    policy, _ = look(params, cue, time)
+    return policy.mean(), policy.stddev()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("probe", PROBES)
+@pytest.mark.parametrize("name", PROJECTIONS)
+def test_successive_policies_are_within_the_bounds(name, probe):
+    """The standard deviation exactly; the mean, which is only drawn back, on average at most twice as far."""
+    params, _ = train_probes("trl", name)[probe]
+    mean_bound, cov_bound = LEARNERS["trl"]().mean_bound, LEARNERS["trl"]().cov_bound
+    states = jnp.array([-1, -1, 1, 1]), jnp.array([0, 1, 0, 1])
+    mean, std = (np.asarray(x, np.float64) for x in mean_and_std(params, *states))
+    (mean, old_mean), (std, old_std) = ((x[:, 1:], x[:, :-1]) for x in (mean, std))
+    assert cov_distance(name, std, old_std).max() <= cov_bound * 1.001
+    assert mean_distance(name, mean, old_mean, old_std).mean(0).max() <= mean_bound * 2
+    if name in ("kl", "wasserstein"):  # whose bounds are bounds of the divergence, whatever the scale
+        divergence = mean_distance("kl", mean, old_mean, old_std) + cov_distance("kl", std, old_std)
+        assert divergence.mean(0).max() <= mean_bound * 2 + cov_bound * 1.1

@@ -33,8 +33,10 @@ class Ticking:
     def step(self, key, state, action):
         state = state.replace(time=state.time + 1)
         is_late = state.time >= self.episode_length
-        metrics = {"time": state.time.astype(jnp.float32)}
-        return state, Step(1 + action[0, 0], state.time >= self.length, is_late, metrics)
+        is_over = state.time >= self.length
+        time = state.time.astype(jnp.float32)
+        metrics = {"time": time, "end": jnp.where(is_late | is_over, time, jnp.nan), "nothing": jnp.array(jnp.nan)}
+        return state, Step(1 + action[0, 0], is_over, is_late, metrics)
 
     def observe(self, state):
         group = Entities(jnp.zeros((1, 0, 1)), jnp.zeros((1, 0), bool))
@@ -99,6 +101,7 @@ def test_evaluation_plays_one_whole_episode_in_each_world(length, steps):
         "return_std": 0.0,
         "episode_length": steps,
         "time": (steps + 1) / 2,
-        "final_time": steps,
+        "end": steps,
+        "nothing": float("nan"),
     }
-    assert {name: float(x) for name, x in metrics.items()} == pytest.approx(expected)
+    assert {name: float(x) for name, x in metrics.items()} == pytest.approx(expected, nan_ok=True)

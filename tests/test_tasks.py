@@ -12,11 +12,26 @@ from jaxswarm.types import Observation
 
 NUM_AGENTS, EPISODE_LENGTH, NUM_WORLDS = 4, 6, 3
 KEY = jax.random.key(1)
+VARIANTS = {
+    "as they are": {},
+    "numbers vary, nearest only": {"active_agents": (2, 3), "max_neighbors": 2, "visibility_radius": 60.0},
+    "boxes vary": {"active_boxes": (1, 3)},
+}
 
 
-@pytest.fixture(params=TASKS)
+def has_fields(cls, fields):
+    return fields.keys() <= {field.name for field in dataclasses.fields(cls)}
+
+
+@pytest.fixture(
+    params=[
+        (task, variant) for task in TASKS for variant, fields in VARIANTS.items() if has_fields(TASKS[task], fields)
+    ],
+    ids=" ".join,
+)
 def task(request):
-    return TASKS[request.param](num_agents=NUM_AGENTS, episode_length=EPISODE_LENGTH)
+    name, variant = request.param
+    return TASKS[name](num_agents=NUM_AGENTS, episode_length=EPISODE_LENGTH, **VARIANTS[variant])
 
 
 @jax.jit
@@ -82,7 +97,7 @@ def test_observations_have_an_own_part_and_masked_groups(task):
         assert group.mask.dtype == jnp.bool
 
 
-@pytest.mark.parametrize("num_agents", [2, 9])
+@pytest.mark.parametrize("num_agents", [3, 9])
 def test_any_number_of_agents_gives_features_of_the_same_size(task, num_agents):
     other = task.replace(num_agents=num_agents)
     obs, other_obs = observe(task, reset(task, KEY)), observe(other, reset(other, KEY))
@@ -94,10 +109,13 @@ def test_any_number_of_agents_gives_features_of_the_same_size(task, num_agents):
 
 
 def test_everything_stays_finite(task):
+    """But metrics, which are NaN where they say nothing."""
     state, actions = reset(task, KEY), random_actions(task, 50)
     for action in actions:
         state, outcome = step(task, KEY, state, action)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, outcome, observe(task, state))))
+        finite = (state, outcome.reward, observe(task, state))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(finite))
+        assert not any(np.isinf(metric) for metric in outcome.metrics.values())
 
 
 def test_the_time_limit_truncates_at_exactly_the_episode_length(task):
@@ -154,10 +172,13 @@ def test_numbers_are_leaves_to_be_mapped_over(task):
         state, outcome = step(task, KEY, reset(task, KEY), random_actions(task))
         return outcome, observe(task, state)
 
-    for name in names:
-        values = getattr(task, name) * jnp.array([0.5, 1.0])
-        outcomes = jax.vmap(lambda value, name=name: play(task.replace(**{name: value})))(values)
-        assert_close(jax.tree.map(lambda leaf: leaf[1], outcomes), play(task), atol=1e-5)
+    others = [task.replace(**{name: 0.5 * getattr(task, name)}) for name in names]
+    tasks = jax.tree.map(lambda *leaves: jnp.array(leaves), task, *others)
+    outcomes = jax.vmap(play)(tasks)
+    assert_close(jax.tree.map(lambda leaf: leaf[0], outcomes), play(task), atol=1e-5)
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(outcomes)]
+    for index in range(1, len(names) + 1):
+        assert any(not np.array_equal(leaf[0], leaf[index], equal_nan=True) for leaf in leaves)
 
 
 def test_trees_of_tasks_can_be_rebuilt(task):

@@ -43,6 +43,7 @@ def test_single_updates_and_one_call_give_the_same_bits(run):
     assert_same_bits(jax.tree.map(lambda *x: jnp.concatenate(x), *rows), expected_metrics)
 
 
+@pytest.mark.slow
 def test_chunks_of_any_length_share_one_program_and_give_the_same_bits(run):
     state, expected, expected_metrics = run
     once = chex.assert_max_traces(train_chunk, n=1)
@@ -61,6 +62,7 @@ def test_evaluations_are_due_before_every_second_update(run):
     np.testing.assert_array_equal(np.isfinite(metrics["eval/return"]), [True, False, True, False, True])
 
 
+@pytest.mark.slow
 def test_evaluation_does_not_change_training(run):
     state, expected, _ = run
     without = EXPERIMENT.replace(eval_every=1000)
@@ -73,6 +75,7 @@ def test_the_program_evaluates_as_the_function_does(run):
         np.testing.assert_allclose(value, metrics[name][0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_equal_single_runs(run):
     _, expected, expected_metrics = run
     keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
@@ -85,6 +88,7 @@ def test_seeds_side_by_side_equal_single_runs(run):
     assert not np.allclose(metrics["eval/return"][0, 0], metrics["eval/return"][1, 0])
 
 
+@pytest.mark.slow
 def test_every_number_that_fixes_no_shape_can_be_swept():
     leaves = jax.tree.leaves(EXPERIMENT)
     assert all(isinstance(x, float) for x in leaves)

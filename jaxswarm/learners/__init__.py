@@ -1,5 +1,9 @@
 """Learners: how a policy gets better from trajectories."""
 
 from jaxswarm.learners.ppo import PPO
+from jaxswarm.learners.projections import PROJECTIONS
+from jaxswarm.learners.trl import TRL
 
-LEARNERS = {"ppo": PPO}
+LEARNERS = {"ppo": PPO, "trl": TRL}
+
+__all__ = ["LEARNERS", "PPO", "PROJECTIONS", "TRL"]

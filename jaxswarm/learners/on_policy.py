@@ -1,11 +1,13 @@
-"""What on-policy learners share: values, advantages, samples, and descent by minibatches.
+"""What on-policy learners share: hyper-parameters, values, advantages, samples, and descent by minibatches.
 
 Every agent's step is a sample of its own, with the common reward and that agent's own value. Samples are numbered
-[steps, worlds, agents] in this order.
+[steps, worlds, agents] in this order. Those of agents that did not exist have no influence on any loss.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +15,61 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.rollout import Trajectory
-from jaxswarm.types import Key, Metrics, Observation, pytree
+from jaxswarm.types import Key, Metrics, Observation, is_whole, pytree, require, static
 
 Params = Any
+Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
+
+USUAL_BATCH_SIZE = 1280
+
+
+@pytree
+class OnPolicy:
+    """Hyper-parameters of every on-policy learner.
+
+    A minibatch has `batch_size` samples, or the possible number nearest to 1280: rows of single agents drawn at random,
+    or those of all agents of randomly drawn worlds, which is faster because they share most of the perceiving. With
+    `bootstrap_truncation` the value of the last state stands for what would have come after a time limit; without,
+    a time limit counts as the end of the world, as in the thesis.
+    """
+
+    learning_rate: float = 3e-3
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    value_coefficient: float = 0.5
+    entropy_coefficient: float = 0.0
+    max_gradient_norm: float = 0.5
+    adam_epsilon: float = 1e-5
+    num_epochs: int = static(default=2)
+    batch_size: int | None = static(default=None)
+    minibatch: Literal["agents", "worlds"] = static(default="worlds")
+    bootstrap_truncation: bool = static(default=True)
+
+
+def check(learner: OnPolicy) -> None:
+    """A `ValueError` names the first of these hyper-parameters that is not possible."""
+    positive = ("learning_rate", "max_gradient_norm", "adam_epsilon")
+    require(learner, "positive numbers", lambda x: x > 0, *positive)
+    require(learner, "numbers from 0 to 1", lambda x: 0 <= x <= 1, "discount", "gae_lambda")
+    require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
+    require(learner, "whole numbers from 1", is_whole(1), "num_epochs")
+    require(learner, "null, whole numbers from 2", lambda x: x is None or is_whole(2)(x), "batch_size")
+    require(learner, "agents, worlds", lambda x: x in ("agents", "worlds"), "minibatch")
+
+
+def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
+    """Samples per gradient step; a `ValueError` says which sizes are possible if the one asked for is not."""
+    asked, unit = learner.batch_size, 1 if learner.minibatch == "agents" else num_agents
+    if asked and num_samples % asked == 0 and asked % unit == 0:
+        return asked
+    possible = [n for n in range(unit, num_samples + 1, unit) if num_samples % n == 0 and n > 1]
+    nearest = sorted(possible, key=lambda n: abs(n - (asked or USUAL_BATCH_SIZE)))[:4]
+    if asked is None:
+        return nearest[0]
+    raise ValueError(
+        f"batch_size = {asked} is not possible; accepted: divisors of num_worlds * num_steps * num_agents = "
+        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest)))}"
+    )
 
 
 @pytree
@@ -24,6 +78,9 @@ class LearnerState:
 
     params: Params
     optimizer_state: optax.OptState
+
+
+State = TypeVar("State", bound=LearnerState)
 
 
 @pytree
@@ -35,6 +92,8 @@ class Batch:
     log_prob: Float[Array, " rows"]  # of the action under the policy that took it
     advantage: Float[Array, " rows"]
     target: Float[Array, " rows"]  # for the value
+    action_mean: Float[Array, "rows action_dim"] | None = None  # of the policy that took it, for those who ask
+    action_std: Float[Array, "rows action_dim"] | None = None
 
 
 @pytree
@@ -46,9 +105,45 @@ class Samples:
     log_prob: Float[Array, " samples"]
     advantage: Float[Array, " samples"]
     target: Float[Array, " samples"]
+    action_mean: Float[Array, "samples action_dim"]
+    action_std: Float[Array, "samples action_dim"]
 
 
 Loss = Callable[[Params, Batch], tuple[Array, Metrics]]
+
+
+def adam(learner: OnPolicy) -> optax.GradientTransformation:
+    """Adam, on shortened gradients."""
+    return optax.chain(
+        optax.clip_by_global_norm(learner.max_gradient_norm),
+        optax.adam(learner.learning_rate, eps=learner.adam_epsilon),
+    )
+
+
+def update(
+    learner: OnPolicy, loss: Loss, key: Key, state: State, network: Any, task: Any, trajectory: Trajectory
+) -> tuple[State, Metrics]:
+    """Descends `loss` on the samples of one trajectory, all epochs."""
+    value, next_value = trajectory_values(network, state.params, task, trajectory)
+    is_done = trajectory.terminated | trajectory.truncated
+    is_terminal = trajectory.terminated if learner.bootstrap_truncation else is_done
+    advantage = generalized_advantages(
+        trajectory.reward, is_terminal, is_done, value, next_value, learner.discount, learner.gae_lambda
+    )
+    target = advantage + value
+    samples = stored_samples(task, trajectory, advantage, target)
+    num_samples = advantage.size
+    state, metrics = descend(
+        key,
+        loss,
+        partial(FETCH[learner.minibatch], task, samples),
+        adam(learner),
+        state,
+        num_samples if learner.minibatch == "agents" else num_samples // task.num_agents,
+        num_samples // batch_size(learner, num_samples, task.num_agents),
+        learner.num_epochs,
+    )
+    return state, metrics | {"explained_variance": explained_variance(value, target, trajectory.mask)}
 
 
 def trajectory_values(
@@ -102,7 +197,8 @@ def stored_samples(
 ) -> Samples:
     """All samples of a trajectory."""
     views = jax.vmap(jax.vmap(task.view))(trajectory.state)
-    arrays = (trajectory.action, trajectory.log_prob, advantage, target)
+    policy = (trajectory.action_mean, trajectory.action_std)
+    arrays = (trajectory.action, trajectory.log_prob, advantage, target, *policy)
     return Samples(jax.tree.map(_merge, views), *[_merge(_merge(x)) for x in arrays])
 
 
@@ -124,7 +220,8 @@ FETCH = {"agents": fetch_agents, "worlds": fetch_worlds}
 
 
 def _batch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) -> Batch:
-    arrays = (samples.action, samples.log_prob, samples.advantage, samples.target)
+    policy = (samples.action_mean, samples.action_std)
+    arrays = (samples.action, samples.log_prob, samples.advantage, samples.target, *policy)
     return Batch(obs, *[x[sample] for x in arrays])
 
 
@@ -152,31 +249,64 @@ def descend(
     loss: Loss,
     fetch: Callable[[Int[Array, " units"]], Batch],
     optimizer: optax.GradientTransformation,
-    state: LearnerState,
+    state: State,
     num_units: int,
     num_minibatches: int,
     num_epochs: int,
-) -> tuple[LearnerState, Metrics]:
+) -> tuple[State, Metrics]:
     """Minibatch gradient descent; each epoch goes through all units once, in a fresh random order.
 
-    The metrics are means over all minibatches.
+    The metrics are means over all minibatches; those called `..._max` are maxima.
     """
 
-    def minibatch(state: LearnerState, units: Int[Array, " units"]) -> tuple[LearnerState, Metrics]:
+    def over(metrics: Metrics) -> Metrics:
+        return {name: (jnp.max if name.endswith("_max") else jnp.mean)(x) for name, x in metrics.items()}
+
+    def minibatch(state: State, units: Int[Array, " units"]) -> tuple[State, Metrics]:
         gradient, metrics = jax.grad(loss, has_aux=True)(state.params, fetch(units))
         updates, optimizer_state = optimizer.update(gradient, state.optimizer_state, state.params)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
-        return LearnerState(optax.apply_updates(state.params, updates), optimizer_state), metrics
+        params = optax.apply_updates(state.params, updates)
+        return dataclasses.replace(state, params=params, optimizer_state=optimizer_state), metrics
 
-    def epoch(state: LearnerState, key: Key) -> tuple[LearnerState, Metrics]:
+    def epoch(state: State, key: Key) -> tuple[State, Metrics]:
         order = shuffled(key, num_minibatches, num_units // num_minibatches)
         state, metrics = jax.lax.scan(minibatch, state, order)
-        return state, jax.tree.map(jnp.mean, metrics)
+        return state, over(metrics)
 
     state, metrics = jax.lax.scan(epoch, state, jax.random.split(key, num_epochs))
-    return state, jax.tree.map(jnp.mean, metrics)
+    return state, over(metrics)
 
 
-def explained_variance(value: Float[Array, "..."], target: Float[Array, "..."]) -> Float[Array, ""]:
+def mean(x: Float[Array, "*#rows"], mask: Mask) -> Float[Array, ""]:
+    """Mean over the rows that exist."""
+    if mask is None:
+        return x.mean()
+    return jnp.where(mask, x, 0.0).sum() / jnp.maximum(mask.sum(), 1)
+
+
+def maximum(x: Float[Array, "#rows"], mask: Mask) -> Float[Array, ""]:
+    """Maximum over the rows that exist, of numbers that are not negative."""
+    return x.max() if mask is None else jnp.where(mask, x, 0.0).max()
+
+
+def standardised(advantage: Float[Array, " rows"], mask: Mask) -> Float[Array, " rows"]:
+    """Advantages of a minibatch with mean 0 and sample standard deviation 1."""
+    num_rows = advantage.size if mask is None else mask.sum()
+    centred = advantage - mean(advantage, mask)
+    variance = mean(jnp.square(centred), mask) * (num_rows / jnp.maximum(num_rows - 1, 1))
+    return centred / (jnp.sqrt(variance) + 1e-8)
+
+
+def squared_error(value: Float[Array, " rows"], target: Float[Array, " rows"], mask: Mask) -> Float[Array, ""]:
+    """Loss of the values."""
+    return mean(jnp.square(value - target), mask)
+
+
+def explained_variance(value: Float[Array, "*rows"], target: Float[Array, "*rows"], mask: Mask) -> Float[Array, ""]:
     """1 for perfect values, 0 for a constant, negative for worse; NaN if there is nothing to explain."""
-    return 1.0 - jnp.var(target - value) / jnp.var(target)
+
+    def variance(x: Array) -> Array:
+        return mean(jnp.square(x - mean(x, mask)), mask)
+
+    return 1.0 - variance(target - value) / variance(target)

@@ -1,6 +1,7 @@
 """The tasks, by name."""
 
 from jaxswarm.tasks.boxes import Assembly, Clustering
+from jaxswarm.tasks.pursuit import Pursuit
 from jaxswarm.tasks.rendezvous import Rendezvous
 
-TASKS = {"rendezvous": Rendezvous, "assembly": Assembly, "clustering": Clustering}
+TASKS = {"rendezvous": Rendezvous, "pursuit": Pursuit, "assembly": Assembly, "clustering": Clustering}

@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxswarm import rigid2d
 from jaxswarm.contacts import BOX_SIDE, MAX_SPEED, MAX_TURN_RATE
 from jaxswarm.geometry import bearing, direction, norm, unit
-from jaxswarm.types import Entities, Key, Observation, Step, is_whole, pytree, require, static
+from jaxswarm.tasks.swarm import NumberRange, draw_number, require_range
+from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_whole, pytree, require, static
 
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # over the side; where clusters belong, in their order
 MARGIN = 0.02  # m, that robots keep off the walls at first
@@ -56,7 +57,7 @@ class Arena:
     side: float
     num_agents: int = static()
     cluster: tuple[int, ...] = static()  # of each box
-    min_boxes: int = static()
+    active_boxes: NumberRange | None = static()
     physics: str = static()
 
     @property
@@ -73,7 +74,7 @@ class Arena:
 
         position = uniform(position_key, self.side / 2, self.num_agents, 2)
         limit = self.side / 2 - MARGIN
-        number = jax.random.randint(number_key, (), self.min_boxes, self.num_boxes + 1)
+        number = draw_number(number_key, self.active_boxes, self.num_boxes)
         state = State(
             position=jnp.clip(position, -limit, limit),
             heading=uniform(heading_key, math.pi, self.num_agents),
@@ -156,13 +157,17 @@ def _mean(values: Float[Array, "*#n"], is_counted: Bool[Array, "*#n"], axis: int
     return jnp.where(is_counted, values, 0).sum(axis) / jnp.maximum(is_counted.sum(axis), 1)
 
 
+def _now_and_finally(is_over: Bool[Array, ""], metrics: Metrics) -> Metrics:
+    """Metrics at every step, and once more at the last."""
+    return metrics | {f"final_{name}": jnp.where(is_over, value, jnp.nan) for name, value in metrics.items()}
+
+
 def _check(task: "Assembly | Clustering") -> None:
     require(task, "whole numbers from 1", is_whole(1), "num_agents", "num_boxes", "episode_length")
     at_least = f"sides of a square that a box fits in, from {2 * BOX_SIDE}"
     require(task, at_least, lambda x: 2 * BOX_SIDE <= x < math.inf, "side")
     require(task, ", ".join(rigid2d.PRESETS), lambda x: x in rigid2d.PRESETS, "physics")
-    in_range = f"null, or whole numbers from 1 to num_boxes = {task.num_boxes}"
-    require(task, in_range, lambda x: x is None or (is_whole(1)(x) and x <= task.num_boxes), "min_boxes")
+    require_range(task, "active_boxes", 1, task.num_boxes)
 
 
 @pytree
@@ -174,7 +179,7 @@ class Assembly:
     side: float = 1.0
     episode_length: int = static(default=512)
     physics: str = static(default="faithful")
-    min_boxes: int | None = static(default=None)
+    active_boxes: NumberRange | None = static(default=None)
 
     action_dim: ClassVar[int] = 2
 
@@ -183,8 +188,8 @@ class Assembly:
 
     @property
     def arena(self) -> Arena:
-        """The world; episodes have from `min_boxes` to `num_boxes` boxes, or always all of them."""
-        return Arena(self.side, self.num_agents, (0,) * self.num_boxes, self.min_boxes or self.num_boxes, self.physics)
+        """The world that robots and boxes are in."""
+        return Arena(self.side, self.num_agents, (0,) * self.num_boxes, self.active_boxes, self.physics)
 
     def reset(self, key: Key) -> State:
         """See `Arena.reset`."""
@@ -200,11 +205,12 @@ class Assembly:
         after = self.arena.move(state, action)
         before_distance, after_distance = _pairs(state.box_position), _pairs(after.box_position)
         is_pair = state.box_present[:, None] & state.box_present[None] & ~jnp.eye(self.num_boxes, dtype=bool)
+        is_over = after.time >= self.episode_length
         step = Step(
             reward=jnp.where(is_pair, before_distance - after_distance, 0).sum() / 2,
             terminated=jnp.array(False),
-            truncated=after.time >= self.episode_length,
-            metrics={"box_distance": _mean(after_distance, is_pair)},
+            truncated=is_over,
+            metrics=_now_and_finally(is_over, {"box_distance": _mean(after_distance, is_pair)}),
         )
         return after, step
 
@@ -238,7 +244,7 @@ class Clustering:
     reward: str = static(default="amplified")
     cluster_identity: str = static(default="groups")
     physics: str = static(default="faithful")
-    min_boxes: int | None = static(default=None)
+    active_boxes: NumberRange | None = static(default=None)
 
     action_dim: ClassVar[int] = 2
 
@@ -257,8 +263,8 @@ class Clustering:
 
     @property
     def arena(self) -> Arena:
-        """The world; episodes have from `min_boxes` to `num_boxes` boxes, or always all of them."""
-        return Arena(self.side, self.num_agents, self.cluster, self.min_boxes or self.num_boxes, self.physics)
+        """The world that robots and boxes are in."""
+        return Arena(self.side, self.num_agents, self.cluster, self.active_boxes, self.physics)
 
     def reset(self, key: Key) -> State:
         """See `Arena.reset`."""
@@ -282,11 +288,12 @@ class Clustering:
         }
         if self.reward == "corners":
             metrics["corner_distance"] = _mean(_to_corners(self, after.box_position), after.box_present)
+        is_over = after.time >= self.episode_length
         step = Step(
             reward=REWARDS[self.reward](self, state, after),
             terminated=jnp.array(False),
-            truncated=after.time >= self.episode_length,
-            metrics=metrics,
+            truncated=is_over,
+            metrics=_now_and_finally(is_over, metrics),
         )
         return after, step
 

@@ -8,8 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxswarm.dynamics import DYNAMICS, Acceleration, Velocity
-from jaxswarm.geometry import Plane, Space, Torus, bearing, direction, norm, unit
-from jaxswarm.types import Entities, Key, Observation, Step, is_whole, pytree, require, static
+from jaxswarm.geometry import Space, direction
+from jaxswarm.neighbors import Neighborhood, neighborhood
+from jaxswarm.tasks import swarm
+from jaxswarm.tasks.swarm import NumberRange, View
+from jaxswarm.types import Entities, Key, Observation, Step, pytree, require, static
 
 RELATIVE_VELOCITY = {
     "normalised": lambda difference, max_speed: difference / (2 * max_speed),  # in [-1, 1]
@@ -25,12 +28,13 @@ class State:
     heading: Float[Array, "agents"]  # rad, counter-clockwise from x, of any number of turns
     velocity: Float[Array, "agents 2"]  # linear speed in world units / s, turn rate in rad / s
     rounding: Float[Array, "agents 5"]  # see `dynamics`
+    active_agents: Int[Array, ""]  # the first ones take part; the others do not exist
     time: Int[Array, ""]  # steps since reset
 
 
 @pytree
-class View:
-    """What is known of each agent by itself, so that pairs need no trigonometry and no other pairs."""
+class Agents:
+    """What is known of each agent by itself."""
 
     position: Float[Array, "agents 2"]
     direction: Float[Array, "agents 2"]  # [cos, sin] of the heading
@@ -41,12 +45,18 @@ class View:
 
 @pytree
 class Rendezvous:
-    """The rendezvous of the thesis (section 5.2.2); its figures used the defaults, but "thesis" relative velocities."""
+    """The rendezvous of the thesis (section 5.2.2); its figures used the defaults, but "thesis" relative velocities.
+
+    With `active_agents` the number of agents of each episode is drawn between these two; `num_agents` is then the most
+    there can be. With `max_neighbors` agents perceive their nearest neighbours only, and a step takes O(num_agents).
+    """
 
     num_agents: int = static(default=20)
+    active_agents: NumberRange | None = static(default=None)
     side: float = 100.0
     torus: bool = static(default=False)
     visibility_radius: float = 100 * math.sqrt(2)
+    max_neighbors: int | None = static(default=None)
     dynamics: str = static(default="acceleration")
     relative_velocity: str = static(default="normalised")
     episode_length: int = static(default=1024)
@@ -54,17 +64,14 @@ class Rendezvous:
     action_dim: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 2", is_whole(2), "num_agents")
-        require(self, "whole numbers from 1", is_whole(1), "episode_length")
-        require(self, "positive numbers", lambda x: x > 0, "side", "visibility_radius")
-        require(self, "True, False", lambda x: isinstance(x, bool), "torus")
+        swarm.require_swarm(self, least=2)
         require(self, ", ".join(DYNAMICS), lambda x: x in DYNAMICS, "dynamics")
         require(self, ", ".join(RELATIVE_VELOCITY), lambda x: x in RELATIVE_VELOCITY, "relative_velocity")
 
     @property
     def space(self) -> Space:
         """Where distances are taken."""
-        return Torus(self.side) if self.torus else Plane(self.side)
+        return swarm.space(self)
 
     @property
     def motion(self) -> Acceleration | Velocity:
@@ -73,13 +80,13 @@ class Rendezvous:
 
     def reset(self, key: Key) -> State:
         """Agents at rest anywhere but within a twentieth of the walls, looking anywhere."""
-        position_key, heading_key = jax.random.split(key)
-        shape = (self.num_agents, 2)
+        position_key, heading_key, number_key = jax.random.split(key, 3)
         return State(
-            position=self.side * jax.random.uniform(position_key, shape, minval=0.05, maxval=0.95),
-            heading=jax.random.uniform(heading_key, shape[:1], maxval=2 * math.pi),
-            velocity=jnp.zeros(shape),
+            position=swarm.draw_positions(position_key, self.side, self.num_agents),
+            heading=jax.random.uniform(heading_key, (self.num_agents,), maxval=2 * math.pi),
+            velocity=jnp.zeros((self.num_agents, 2)),
             rounding=jnp.zeros((self.num_agents, 5)),
+            active_agents=swarm.draw_number(number_key, self.active_agents, self.num_agents),
             time=jnp.zeros((), jnp.int32),
         )
 
@@ -91,20 +98,27 @@ class Rendezvous:
         after the move, of the action as given; the move clips it to [-1, 1].
         """
         state = self.motion.move(self.space, state, action).replace(time=state.time + 1)
-        distance = self.distances(state.position)
-        num_pairs = self.num_agents * (self.num_agents - 1)
-        spread = jnp.minimum(distance, self.visibility_radius).sum() / num_pairs
+        is_present = swarm.is_present(state.active_agents, self.num_agents)
+        around = self.around(state)
+        num_pairs = state.active_agents * (state.active_agents - 1)
+        distance = jnp.where(is_present, around.spread, 0.0).sum() / num_pairs
+        effort = jnp.where(is_present[:, None], jnp.square(action), 0.0).sum() / (2 * state.active_agents)
+        is_over = state.time >= self.episode_length
         step = Step(
-            reward=-spread / self.visibility_radius - 0.001 * jnp.square(action).mean(),
+            reward=-distance / self.visibility_radius - 0.001 * effort,
             terminated=jnp.array(False),
-            truncated=state.time >= self.episode_length,
-            metrics={"distance": distance.sum() / num_pairs},
+            truncated=is_over,
+            metrics={"distance": distance, "final_distance": jnp.where(is_over, distance, jnp.nan)}
+            | swarm.overflow(around, is_present, self.max_neighbors),
         )
         return state, step
 
-    def distances(self, position: Float[Array, "agents 2"]) -> Float[Array, "agents agents"]:
-        """Between all agents."""
-        return norm(self.space.displacement(position[:, None], position[None]))
+    def around(self, state: State) -> Neighborhood:
+        """Who is near each agent."""
+        is_present = swarm.is_present(state.active_agents, self.num_agents)
+        return neighborhood(
+            self.space, state.position, is_present, self.visibility_radius, self.is_visible, self.max_neighbors
+        )
 
     def is_visible(self, distance: Float[Array, "*n"]) -> Array:
         """An agent at exactly one's own place is not."""
@@ -112,42 +126,37 @@ class Rendezvous:
 
     def view(self, state: State) -> View:
         """What `perceive` needs of a state, in O(agents) memory."""
-        num_visible = self.is_visible(self.distances(state.position)).sum(-1, keepdims=True).astype(jnp.float32)
+        around = self.around(state)
+        num_visible = around.num_visible[:, None].astype(jnp.float32)
         feeling = self.motion.proprioception(state.velocity)
-        return View(
+        agents = Agents(
             position=state.position,
             direction=direction(state.heading),
             velocity=self.motion.world_velocity(state.heading, state.velocity),
             num_visible=num_visible,
-            own=jnp.concatenate([num_visible / (self.num_agents - 1), feeling], -1),
+            own=jnp.concatenate([num_visible / (state.active_agents - 1), feeling], -1),
         )
+        return View(agents, state.active_agents, around.nearest)
 
     def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
         """What one agent perceives; its neighbours stand in cyclic order, from the agent after it on.
 
         Own features: fraction of the others that is visible, and the motion's proprioception. Neighbours': distance
         over the square's diagonal, bearing to them and from them as [cos, sin], relative velocity (own - theirs) in
-        world axes, visible agents (theirs - own) over num_agents - 2. Those out of sight are masked, and zero.
+        world axes, visible agents (theirs - own) over agents - 2. Those out of sight are masked, and zero.
         """
-
-        def window(start: Array, size: int) -> View:
-            twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), view)
-            return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size), twice)
-
-        me, them = window(agent, 1), window(agent + 1, self.num_agents - 1)
-        displacement = self.space.displacement(me.position, them.position)
-        distance = norm(displacement)
-        toward = unit(displacement, distance)
-        mask = self.is_visible(distance)
+        me, them, is_present = swarm.pick(view, agent)
+        distance, bearings = swarm.sight(self.space, me, them)
+        mask = is_present & self.is_visible(distance)
         features = [
             distance[:, None] / (self.side * math.sqrt(2)),
-            bearing(me.direction, toward),
-            bearing(them.direction, -toward),
+            bearings,
             RELATIVE_VELOCITY[self.relative_velocity](me.velocity - them.velocity, self.motion.max_speed),
-            (them.num_visible - me.num_visible) / max(self.num_agents - 2, 1),
+            (them.num_visible - me.num_visible) / jnp.maximum(view.active_agents - 2, 1),
         ]
         neighbors = Entities(features=jnp.where(mask[:, None], jnp.concatenate(features, -1), 0), mask=mask)
-        return Observation(own=me.own[0], groups={"neighbors": neighbors})
+        is_active = None if self.active_agents is None else agent < view.active_agents
+        return Observation(own=me.own[0], groups={"neighbors": neighbors}, mask=is_active)
 
     def observe(self, state: State) -> Observation:
         """What each agent perceives; see `perceive`."""

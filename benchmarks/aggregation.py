@@ -1,0 +1,127 @@
+"""How fast every aggregator is in every layout; one JSON line per combination.
+
+    python benchmarks/aggregation.py [PATH] [aggregators=mean,max] [rows=4000] [slots=19] [features=64] [repeats=5]
+
+A network encodes the 8 features of each entity (one layer), aggregates, and decodes (one layer); times are minima over
+the repeats, of the output and of the output with its gradient with respect to all parameters. All combinations of one
+size take turns within a repeat, so that their ratios are of the same minutes, and so does the product of two
+2048 x 2048 matrices, whose speed says what the machine could do in them. Layout "chosen" is the one that training uses;
+the others are forced.
+"""
+
+import itertools
+import json
+import platform
+import sys
+import time
+from pathlib import Path
+
+import flax
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from jaxswarm import AGGREGATORS, sets
+from jaxswarm.networks import Beside, Encoder
+from jaxswarm.types import Entities
+
+GRID = {
+    "aggregators": [*AGGREGATORS],
+    "rows": [256, 1000, 4000, 16000],
+    "slots": [5, 19, 49],
+    "features": [64, 120],
+    "repeats": [5],
+}
+OWN, DIM = 3, 8
+
+
+class Network(nn.Module):
+    aggregator: nn.Module
+    width: int
+    layout: str | None
+
+    @nn.compact
+    def __call__(self, own, group):
+        is_raw = self.aggregator.num_encoders == 0
+        encoder = Beside(()) if is_raw else Encoder((self.width,), "leaky_relu", self.aggregator.num_parts)
+        aggregator = self.aggregator.copy(name="pooling")
+        pool = sets.Pool(aggregator, (encoder,), DIM if is_raw else self.width, self.layout)
+        return nn.leaky_relu(nn.Dense(self.width)(jnp.concatenate([own, pool((group,), own)], -1)))
+
+
+def programs(name, layout, rows, slots, width):
+    """Forward, and forward with gradient, compiled."""
+    model = Network(AGGREGATORS[name](), width, layout)
+    keys = jax.random.split(jax.random.key(0), 3)
+    group = Entities(jax.random.normal(keys[0], (rows, slots, DIM)), jnp.ones((rows, slots), bool))
+    own = jax.random.normal(keys[1], (rows, OWN))
+    params = jax.jit(model.init)(keys[2], own[:1], jax.tree.map(lambda x: x[:1], group))
+    forward = jax.jit(lambda p, o, g: model.apply(p, o, g).sum()).lower(params, own, group).compile()
+    gradient = jax.jit(jax.value_and_grad(lambda p, o, g: model.apply(p, o, g).sum()))
+    gradient = gradient.lower(params, own, group).compile()
+    return {"forward": lambda: forward(params, own, group), "gradient": lambda: gradient(params, own, group)}
+
+
+def minima(calls, repeats):
+    """Seconds of each call, after one that does not count; a call of less than 20 ms is repeated within its turn."""
+    best = {}
+    for repeat, (name, call) in itertools.product(range(repeats + 1), calls.items()):
+        for _ in range(1 + int(0.02 / best.get(name, 1.0))):
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            seconds = time.perf_counter() - start
+            best[name] = min(best[name], seconds) if repeat > 0 and name in best else seconds
+    return best
+
+
+def measure(names, rows, slots, width, repeats):
+    """Results of all aggregators and layouts at one size."""
+    matrix = jax.random.normal(jax.random.key(3), (2048, 2048))
+    product = jax.jit(lambda x: x @ x)
+    calls = {("gemm", "", ""): lambda: product(matrix)}
+    for name in names:
+        is_monoid = isinstance(AGGREGATORS[name](), sets.Monoid)
+        for layout in ("chosen", "streaming", "dense", "segments") if is_monoid else ("chosen", "segments"):
+            forced = None if layout == "chosen" else layout
+            for kind, call in programs(name, forced, rows, slots, width).items():
+                calls[name, layout, kind] = call
+    best = minima(calls, repeats)
+    gemm = 2 * 2048**3 / best.pop(("gemm", "", ""))
+    for name, layout in dict.fromkeys((name, layout) for name, layout, _ in best):
+        forward, gradient = (best[name, layout, kind] for kind in ("forward", "gradient"))
+        yield {
+            "benchmark": "aggregation",
+            "aggregator": name,
+            "layout": layout,
+            "rows": rows,
+            "slots": slots,
+            "features": width,
+            "forward_seconds": forward,
+            "gradient_seconds": gradient,
+            "gradient_rows_per_second": rows / gradient,
+            "gemm_gflops": gemm / 1e9,
+        }
+
+
+def main(words):
+    """Prints the results and, given a path, appends them to that file."""
+    path = next((Path(word) for word in words if "=" not in word), None)
+    given = {key: value.split(",") for key, _, value in (word.partition("=") for word in words if "=" in word)}
+    if unknown := [key for key in given if key not in GRID]:
+        raise ValueError(f"{unknown[0]} is not possible; accepted: {', '.join(GRID)}")
+    grid = GRID | {key: value if key == "aggregators" else [int(x) for x in value] for key, value in given.items()}
+    device = jax.devices()[0]
+    versions = {"python": platform.python_version(), "jax": jax.__version__, "flax": flax.__version__}
+    about = {"versions": versions, "device": {"backend": device.platform, "kind": device.device_kind}}
+    for size in itertools.product(grid["rows"], grid["slots"], grid["features"]):
+        for result in measure(grid["aggregators"], *size, grid["repeats"][0]):
+            rounded = {name: float(f"{x:.4g}") if isinstance(x, float) else x for name, x in result.items()}
+            line = json.dumps(rounded | about)
+            print(line, flush=True)
+            if path:
+                with path.open("a") as file:
+                    file.write(line + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,225 @@
+"""Pursuit: agents are to catch evaders that are twice as fast as they are."""
+
+import dataclasses
+import math
+from typing import ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxswarm.dynamics import Velocity
+from jaxswarm.geometry import Space, bearing, direction, norm, unit
+from jaxswarm.neighbors import Neighborhood, neighborhood
+from jaxswarm.tasks import swarm
+from jaxswarm.tasks.evasion import flight
+from jaxswarm.tasks.swarm import NumberRange
+from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_whole, pytree, require, static
+
+EVADER_STRIDE = 2.0  # world units in one step, twice what a pursuer can do
+CATCH_DISTANCE = {"distance": 1.0, "catches": 2.0}  # world units
+WALL_LOW, WALL_HIGH = 1.0, 99.0  # beyond these is "at a wall", whatever the side: so in the thesis's program
+
+
+@pytree
+class State:
+    """One world."""
+
+    position: Float[Array, "agents 2"]  # world units, in [0, side]
+    heading: Float[Array, "agents"]  # rad, counter-clockwise from x, of any number of turns
+    velocity: Float[Array, "agents 2"]  # linear speed in world units / s, turn rate in rad / s
+    rounding: Float[Array, "agents 5"]  # see `dynamics`
+    evader_position: Float[Array, "evaders 2"]
+    evader_age: Int[Array, " evaders"]  # steps since the evader was put where it started
+    catches: Int[Array, ""]  # so far
+    active_agents: Int[Array, ""]  # the first ones take part; the others do not exist
+    active_evaders: Int[Array, ""]
+    time: Int[Array, ""]  # steps since reset
+
+
+@pytree
+class Agents:
+    """What is known of each agent by itself."""
+
+    position: Float[Array, "agents 2"]
+    direction: Float[Array, "agents 2"]  # [cos, sin] of the heading
+    own: Float[Array, "agents own_dim"]
+
+
+@pytree
+class View(swarm.View):
+    """What `perceive` needs of a state."""
+
+    evader_position: Float[Array, "evaders 2"]
+    active_evaders: Int[Array, ""]
+
+
+@pytree
+class Pursuit:
+    """The pursuits of the thesis (sections 5.2.3 and 5.2.4).
+
+    With `reward="distance"` it is the distance of the pursuer that is nearest to an evader, and an evader caught (at 1
+    unit) ends the episode. With `"catches"` every evader caught (at 2 units) gives 1 and starts anew somewhere else.
+    Evaders flee from those that they see within `evader_visibility_radius`, which is also how far they are seen.
+    Numbers of agents and evaders are drawn for each episode within `active_agents` and `active_evaders`, if given.
+    With `max_neighbors` agents perceive their nearest neighbours only, and perceiving takes O(num_agents).
+    """
+
+    num_agents: int = static(default=10)
+    num_evaders: int = static(default=1)
+    active_agents: NumberRange | None = static(default=None)
+    active_evaders: NumberRange | None = static(default=None)
+    side: float = 100.0
+    torus: bool = static(default=True)
+    visibility_radius: float = 100 * math.sqrt(2)
+    evader_visibility_radius: float = 100 * math.sqrt(2)
+    max_neighbors: int | None = static(default=None)
+    reward: Literal["distance", "catches"] = static(default="distance")
+    episode_length: int = static(default=1024)
+
+    action_dim: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        swarm.require_swarm(self, least=1)
+        require(self, "whole numbers from 1", is_whole(1), "num_evaders")
+        swarm.require_range(self, "active_evaders", 1, self.num_evaders)
+        require(self, "positive numbers", lambda x: x > 0, "evader_visibility_radius")
+        require(self, ", ".join(CATCH_DISTANCE), lambda x: x in CATCH_DISTANCE, "reward")
+
+    @property
+    def space(self) -> Space:
+        """Where distances are taken."""
+        return swarm.space(self)
+
+    @property
+    def motion(self) -> Velocity:
+        """How agents move."""
+        return Velocity(max_turn_rate=2 * math.pi)
+
+    def reset(self, key: Key) -> State:
+        """Agents and evaders anywhere but within a twentieth of the sides, agents looking anywhere."""
+        position_key, heading_key, evader_key, agents_key, evaders_key = jax.random.split(key, 5)
+        return State(
+            position=swarm.draw_positions(position_key, self.side, self.num_agents),
+            heading=jax.random.uniform(heading_key, (self.num_agents,), maxval=2 * math.pi),
+            velocity=jnp.zeros((self.num_agents, 2)),
+            rounding=jnp.zeros((self.num_agents, 5)),
+            evader_position=swarm.draw_positions(evader_key, self.side, self.num_evaders),
+            evader_age=jnp.zeros(self.num_evaders, jnp.int32),
+            catches=jnp.zeros((), jnp.int32),
+            active_agents=swarm.draw_number(agents_key, self.active_agents, self.num_agents),
+            active_evaders=swarm.draw_number(evaders_key, self.active_evaders, self.num_evaders),
+            time=jnp.zeros((), jnp.int32),
+        )
+
+    def step(self, key: Key, state: State, action: Float[Array, "agents 2"]) -> tuple[State, Step]:
+        """One step of 0.1 s; the only thing random in it is where caught evaders start anew.
+
+        1. "catches": evaders closer than 2 units to an agent after the last step are caught, and put anywhere.
+        2. Evaders move by 2 units, away from where the agents were.
+        3. Agents move.
+        4. "distance": the reward is -min(d, R) / R, d the smallest distance of all, R = evader_visibility_radius; below
+           1 unit the evader is caught, and the task is over.
+        """
+        if self.reward == "catches":
+            caught, age = self.is_caught(state), state.evader_age
+            state = self._move(self._restart(key, state, caught), action)
+            reward, is_solved = caught.sum().astype(jnp.float32), jnp.array(False)
+        else:
+            state = self._move(state, action)
+            caught, age = self.is_caught(state), state.evader_age
+            smallest = jnp.minimum(self.distances(state).min(), self.evader_visibility_radius)
+            reward, is_solved = -smallest / self.evader_visibility_radius, caught.any()
+        state = dataclasses.replace(state, catches=state.catches + caught.sum(dtype=jnp.int32))
+        is_over = state.time >= self.episode_length
+        metrics = self._metrics(state, is_solved | is_over, is_solved)
+        metrics["capture_time"] = jnp.where(caught, age, 0).sum() / jnp.where(caught.any(), caught.sum(), jnp.nan)
+        return state, Step(reward, is_solved, is_over & ~is_solved, metrics)
+
+    def distances(self, state: State) -> Float[Array, "agents evaders"]:
+        """Between agents and evaders; infinite where one of the two does not take part."""
+        distance = norm(self.space.displacement(state.position[:, None], state.evader_position[None]))
+        is_agent = swarm.is_present(state.active_agents, self.num_agents)
+        is_evader = swarm.is_present(state.active_evaders, self.num_evaders)
+        return jnp.where(is_agent[:, None] & is_evader[None], distance, jnp.inf)
+
+    def is_caught(self, state: State) -> Bool[Array, " evaders"]:
+        """Which evaders an agent is close enough to."""
+        return (self.distances(state) < CATCH_DISTANCE[self.reward]).any(0)
+
+    def _restart(self, key: Key, state: State, caught: Bool[Array, " evaders"]) -> State:
+        start = swarm.draw_positions(key, self.side, self.num_evaders)
+        return dataclasses.replace(
+            state,
+            evader_position=jnp.where(caught[:, None], start, state.evader_position),
+            evader_age=jnp.where(caught, 0, state.evader_age),
+        )
+
+    def _move(self, state: State, action: Float[Array, "agents 2"]) -> State:
+        """Evaders first, all from the same state, then agents."""
+        is_present = swarm.is_present(state.active_agents, self.num_agents)
+        flee = jax.vmap(flight, (None, 0, None, None, None))
+        way = flee(self.space, state.evader_position, state.position, is_present, self.evader_visibility_radius)
+        evader_position = self.space.confine(state.evader_position + EVADER_STRIDE * way)
+        state = self.motion.move(self.space, state, action)
+        return dataclasses.replace(
+            state, evader_position=evader_position, evader_age=state.evader_age + 1, time=state.time + 1
+        )
+
+    def _metrics(self, state: State, is_over: Bool[Array, ""], is_solved: Bool[Array, ""]) -> Metrics:
+        is_present = swarm.is_present(state.active_agents, self.num_agents)
+        nearest = jnp.where(is_present, self.distances(state).min(-1), 0.0).sum() / state.active_agents
+        metrics = {"evader_distance": nearest, "catches": jnp.where(is_over, state.catches, jnp.nan)}
+        if self.reward == "distance":
+            metrics["caught"] = jnp.where(is_over, is_solved, jnp.nan)
+        return metrics | swarm.overflow(self.around(state), is_present, self.max_neighbors)
+
+    def around(self, state: State) -> Neighborhood:
+        """Who is near each agent."""
+        is_present = swarm.is_present(state.active_agents, self.num_agents)
+        return neighborhood(
+            self.space,
+            state.position,
+            is_present,
+            self.visibility_radius,
+            lambda distance: distance <= self.visibility_radius,
+            self.max_neighbors,
+        )
+
+    def view(self, state: State) -> View:
+        """What `perceive` needs of a state, in O(agents) memory."""
+        around = self.around(state)
+        own = [around.num_visible / jnp.maximum(state.active_agents - 1, 1)]
+        if not self.torus:
+            own.append(((state.position <= WALL_LOW) | (state.position >= WALL_HIGH)).any(-1).astype(jnp.float32))
+        agents = Agents(state.position, direction(state.heading), jnp.stack(own, -1))
+        return View(agents, state.active_agents, around.nearest, state.evader_position, state.active_evaders)
+
+    def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
+        """What one agent perceives; its neighbours stand in cyclic order, from the agent after it on.
+
+        Own features: fraction of the others that is visible; with walls also whether it is at one. Neighbours':
+        distance over visibility_radius, bearing to them and from them as [cos, sin]. Evaders': distance over
+        evader_visibility_radius, bearing to them. Those out of sight are masked, and zero.
+        """
+        me, them, is_present = swarm.pick(view, agent)
+        distance, bearings = swarm.sight(self.space, me, them)
+        neighbors = _entities(distance, bearings, self.visibility_radius, is_present)
+        to_evaders = self.space.displacement(me.position, view.evader_position)
+        distance = norm(to_evaders)
+        bearings = bearing(me.direction, unit(to_evaders, distance))
+        is_present = swarm.is_present(view.active_evaders, self.num_evaders)
+        evaders = _entities(distance, bearings, self.evader_visibility_radius, is_present)
+        is_active = None if self.active_agents is None else agent < view.active_agents
+        return Observation(own=me.own[0], groups={"neighbors": neighbors, "evaders": evaders}, mask=is_active)
+
+    def observe(self, state: State) -> Observation:
+        """What each agent perceives; see `perceive`."""
+        return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
+
+
+def _entities(distance: Array, bearings: Array, radius: Array | float, is_present: Array) -> Entities:
+    """Entities that are present and not farther than the radius."""
+    mask = is_present & (distance <= radius)
+    features = jnp.concatenate([distance[:, None] / radius, bearings], -1)
+    return Entities(jnp.where(mask[:, None], features, 0.0), mask)

@@ -1,0 +1,101 @@
+"""What swarms of points have in common: how many take part, where they start, and who each of them looks at."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxswarm.geometry import Plane, Space, Torus, bearing, norm, unit
+from jaxswarm.neighbors import Neighborhood
+from jaxswarm.types import Key, Metrics, is_whole, pytree, require
+
+NumberRange = tuple[int, int]  # lowest and highest
+
+
+@pytree
+class View:
+    """What is known of each agent by itself, so that pairs need no trigonometry and no other pairs."""
+
+    agents: Any  # leaves [agents, ...], with at least `position` and `direction`
+    active_agents: Int[Array, ""]
+    nearest: Int[Array, "agents max_neighbors"] | None  # whom to look at; None: at everybody
+
+
+def require_swarm(task: Any, least: int) -> None:
+    """Checks the fields that tasks of point swarms share."""
+    require(task, f"whole numbers from {least}", is_whole(least), "num_agents")
+    require(task, "whole numbers from 1", is_whole(1), "episode_length")
+    require(task, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "max_neighbors")
+    require(task, "positive numbers", lambda x: x > 0, "side", "visibility_radius")
+    require(task, "True, False", lambda x: isinstance(x, bool), "torus")
+    require_range(task, "active_agents", least, task.num_agents)
+
+
+def require_range(task: Any, name: str, least: int, most: int) -> None:
+    """Checks a field that is a range of numbers of which one is drawn for each episode, or None."""
+
+    def is_accepted(value: Any) -> bool:
+        is_pair = isinstance(value, tuple) and len(value) == 2 and all(map(is_whole(least), value))
+        return value is None or (is_pair and value[0] <= value[1] <= most)
+
+    require(task, f"null, a pair (low, high) from {least} to {most}", is_accepted, name)
+
+
+def space(task: Any) -> Space:
+    """Where distances are taken."""
+    return Torus(task.side) if task.torus else Plane(task.side)
+
+
+def draw_number(key: Key, bounds: NumberRange | None, most: int) -> Int[Array, ""]:
+    """How many take part in an episode: any number within the bounds, both included; without bounds, all."""
+    if bounds is None:
+        return jnp.array(most, jnp.int32)
+    return jax.random.randint(key, (), bounds[0], bounds[1] + 1)
+
+
+def draw_positions(key: Key, side: float | Float[Array, ""], num_points: int) -> Float[Array, "points 2"]:
+    """Anywhere but within a twentieth of the sides."""
+    return side * jax.random.uniform(key, (num_points, 2), minval=0.05, maxval=0.95)
+
+
+def is_present(active: Int[Array, ""], num_slots: int) -> Bool[Array, " slots"]:
+    """The first ones take part."""
+    return jnp.arange(num_slots) < active
+
+
+def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_neighbors: int | None) -> Metrics:
+    """How many visible neighbours agents do not perceive, on average, because there is room for so many only."""
+    if max_neighbors is None:
+        return {}
+    missed = jnp.maximum(neighborhood.num_visible - max_neighbors, 0)
+    return {"unseen_neighbors": jnp.where(present, missed, 0).sum() / present.sum()}
+
+
+def pick(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " others"]]:
+    """The agent, leaves [1, ...]; those it may see, leaves [others, ...]; and whether they take part.
+
+    Without a list of the nearest these are all others in cyclic order, from the agent after it on: slices of doubled
+    arrays, which are faster than a gather.
+    """
+    num_agents = view.agents.position.shape[0]
+
+    def window(start: Array, size: int) -> Any:
+        twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), view.agents)
+        return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size), twice)
+
+    if view.nearest is not None:
+        nearest = view.nearest[agent]
+        me, them = (jax.tree.map(lambda leaf, i=i: leaf[i], view.agents) for i in (agent[None], nearest))
+        return me, them, nearest >= 0
+    index = agent + jnp.arange(1, num_agents)
+    index = jnp.where(index < num_agents, index, index - num_agents)
+    return window(agent, 1), window(agent + 1, num_agents - 1), index < view.active_agents
+
+
+def sight(space: Space, me: Any, them: Any) -> tuple[Float[Array, "others"], Float[Array, "others 4"]]:
+    """Distance; and bearing to them and from them, as [cos, sin] each."""
+    displacement = space.displacement(me.position, them.position)
+    distance = norm(displacement)
+    toward = unit(displacement, distance)
+    return distance, jnp.concatenate([bearing(me.direction, toward), bearing(them.direction, -toward)], -1)
