@@ -11,8 +11,9 @@ import jax
 import numpy as np
 import pytest
 
-from jaxswarm import checkpoint, cli, reporting
+from jaxswarm import checkpoint, reporting
 from jaxswarm import config as configs
+from jaxswarm.cli import evaluate, train
 from jaxswarm.fit import abstract_state
 
 TINY = [
@@ -34,13 +35,13 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def finished(cache, tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("runs") / "finished"
-    assert cli.train([*TINY, "num_updates=4", f"run_dir={run_dir}"]) == 0
+    assert train.main([*TINY, "num_updates=4", f"run_dir={run_dir}"]) == 0
     return run_dir
 
 
 def test_training_ends_with_its_files_and_the_next_command(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert cli.train([*TINY, "num_updates=4"]) == 0
+    assert train.main([*TINY, "num_updates=4"]) == 0
     out = capsys.readouterr().out
     (run_dir,) = (tmp_path / "runs").iterdir()
     assert run_dir.name.startswith("rendezvous-mean-ppo-")
@@ -59,17 +60,17 @@ def test_what_was_compiled_is_kept_for_the_next_start(finished):
 
 
 def test_a_run_folder_is_never_overwritten(finished, capsys):
-    assert cli.train([*TINY, f"run_dir={finished}"]) == 2
+    assert train.main([*TINY, f"run_dir={finished}"]) == 2
     assert f"resume={finished}" in capsys.readouterr().err
 
 
 def test_resuming_a_finished_run_says_so(finished, capsys):
-    assert cli.train([f"resume={finished}"]) == 0
+    assert train.main([f"resume={finished}"]) == 0
     assert "is finished: 4 of 4 updates" in capsys.readouterr().out
 
 
 def test_a_finished_run_can_be_made_longer(finished, capsys):
-    assert cli.train([f"resume={finished}", "num_updates=5"]) == 0
+    assert train.main([f"resume={finished}", "num_updates=5"]) == 0
     assert [row["update"] for row in reporting.read_rows(finished / "metrics.csv")] == [0, 3, 5]
     assert "num_updates: 5" in (finished / "config.yaml").read_text()
 
@@ -84,8 +85,8 @@ def test_a_finished_run_can_be_made_longer(finished, capsys):
 )
 def test_nothing_but_the_length_changes_on_resume(finished, capsys, words, parts):
     parts = [part.replace("4 updates", "5 updates") for part in parts]
-    assert cli.train([f"resume={finished}", "num_updates=5"]) == 0
-    assert cli.train([f"resume={finished}", *words]) == 2
+    assert train.main([f"resume={finished}", "num_updates=5"]) == 0
+    assert train.main([f"resume={finished}", *words]) == 2
     err = capsys.readouterr().err
     assert all(part in err for part in parts), err
 
@@ -103,7 +104,7 @@ def test_nothing_but_the_length_changes_on_resume(finished, capsys, words, parts
 )
 def test_a_wrong_command_is_one_line_and_writes_nothing(tmp_path, monkeypatch, capsys, words, parts):
     monkeypatch.chdir(tmp_path)
-    assert cli.train(words) == 2
+    assert train.main(words) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
@@ -113,16 +114,16 @@ def test_a_wrong_command_is_one_line_and_writes_nothing(tmp_path, monkeypatch, c
 
 
 def test_help_shows_groups_choices_and_keys(capsys):
-    assert cli.train(["--help"]) == 0
+    assert train.main(["--help"]) == 0
     out = capsys.readouterr().out
     assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_worlds: 32", "resume=PATH"))
-    assert cli.evaluate(["-h"]) == 0
+    assert evaluate.main(["-h"]) == 0
     assert "task.num_agents=5,10" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", [[], ["checkpoint=last", "task.num_agents=7", "episodes=3"]])
 def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, words):
-    assert cli.evaluate([str(finished), "seed=1", *words]) == 0
+    assert evaluate.main([str(finished), "seed=1", *words]) == 0
     out = capsys.readouterr().out
     path = out.splitlines()[-1].removeprefix("wrote ")
     result = json.loads(Path(path).read_text())
@@ -133,7 +134,7 @@ def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, words):
 
 
 def test_a_policy_is_evaluated_in_swarms_of_several_sizes(finished, capsys):
-    assert cli.evaluate([str(finished), "task.num_agents=2,5", "task.torus=true,false"]) == 0
+    assert evaluate.main([str(finished), "task.num_agents=2,5", "task.torus=true,false"]) == 0
     lines = capsys.readouterr().out.splitlines()
     results = json.loads(Path(lines[-1].removeprefix("wrote ")).read_text())["results"]
     assert [result["task"]["num_agents"] for result in results] == [2, 2, 5, 5]
@@ -158,19 +159,19 @@ def test_a_policy_is_evaluated_in_swarms_of_several_sizes(finished, capsys):
     ],
 )
 def test_a_wrong_evaluation_is_one_line(finished, capsys, words, part):
-    assert cli.evaluate([str(finished), *words]) == 2
+    assert evaluate.main([str(finished), *words]) == 2
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1
 
 
 def test_a_folder_without_a_run_cannot_be_evaluated(tmp_path, capsys):
-    assert cli.evaluate([str(tmp_path)]) == 2
+    assert evaluate.main([str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
 
 
 def start(*words):
-    program = "import sys; from jaxswarm import cli; sys.exit(cli.train(sys.argv[1:]))"
+    program = "import sys; from jaxswarm.cli import train; sys.exit(train.main(sys.argv[1:]))"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([sys.executable, "-c", program, *map(str, words)], **pipes)
 
@@ -191,7 +192,7 @@ def wait_for_rows(process, run_dir, num_rows):
 def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(cache, tmp_path):
     words = [*TINY, "num_updates=3000", "checkpoint_seconds=0.05"]
     undisturbed, run_dir = tmp_path / "undisturbed", tmp_path / "run"
-    assert cli.train([*words, f"run_dir={undisturbed}"]) == 0
+    assert train.main([*words, f"run_dir={undisturbed}"]) == 0
     process = start(*words, f"run_dir={run_dir}")
     for num_rows, number, code in ((50, signal.SIGKILL, -9), (200, signal.SIGKILL, -9), (400, signal.SIGTERM, 0)):
         wait_for_rows(process, run_dir, num_rows)

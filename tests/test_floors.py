@@ -26,6 +26,8 @@ FLOORS = [
     {"config", "checkpoint"},
     {"reporting"},
     {"fit"},
+    {"cli.words"},
+    {"cli.train", "cli.evaluate"},
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

@@ -1,0 +1,111 @@
+"""The program `jaxswarm-eval`."""
+
+import functools
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxswarm import config as configs
+from jaxswarm.cli.words import load, only, program, resume_command, split, use_compile_cache, wants_help, whole
+from jaxswarm.config import Config, ConfigError
+
+HELP = """\
+jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [task.key=value[,value...]] ...
+
+Evaluates the trained policy of a run folder, also on changed tasks: prints a table and writes JSON into the folder.
+The action is the mean of the policy; each episode is played in a world of its own.
+
+examples
+  jaxswarm-eval runs/thesis
+  jaxswarm-eval runs/thesis episodes=100 checkpoint=last task.num_agents=5,10,20,50,100,200
+"""
+
+
+@program
+def main(arguments: Sequence[str]) -> int:
+    """Evaluates the policy of a run; returns the exit code."""
+    if wants_help(arguments) or not arguments:
+        print(HELP)
+        return 0 if arguments else 2
+    paths = [word for word in arguments if "=" not in word]
+    options, words = split([word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed"))
+    if len(paths) != 1:
+        raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
+    which = options.get("checkpoint", "best")
+    if which not in ("best", "last"):
+        raise ConfigError(f"checkpoint = {which!r} is not possible; accepted: best, last")
+    config = load(Path(paths[0]))
+    episodes = whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
+    seed = whole("seed", options.get("seed", 0), 0)
+    changes = configs.combinations(words)
+    only(changes[0], lambda key: key.startswith("task."), "task.<field>=value")
+    asked = {"which": which, "seed": seed, "episodes": episodes}
+    result = _evaluate(Path(paths[0]), config, changes, asked)
+    return _report(Path(paths[0]), result) if result else 1
+
+
+def _evaluate(
+    run_dir: Path, config: Config, changes: Sequence[Sequence[tuple[str, Any]]], asked: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Plays the episodes of every changed task; `None` after saying that no checkpoint can be restored."""
+    experiment = configs.build(config)
+    tasks = [configs.override(config, pairs)["task"] for pairs in changes]
+    built = [configs.build_part("task", {"task": task}) for task in tasks]
+    use_compile_cache()
+    import jax  # noqa: PLC0415
+
+    from jaxswarm import rollout  # noqa: PLC0415
+    from jaxswarm.checkpoint import CheckpointError, restore  # noqa: PLC0415
+    from jaxswarm.fit import abstract_state  # noqa: PLC0415
+
+    warn = functools.partial(print, file=sys.stderr)
+    try:
+        restored = restore(run_dir / "checkpoints", abstract_state(experiment), asked["which"], warn)
+    except CheckpointError as error:
+        warn(f"error: {error}")
+        return None
+    if restored is None:
+        raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: {resume_command(run_dir)}")
+    params, key = restored.train_state.learner.params, jax.random.key(asked["seed"])
+    for task in built:
+        needed = jax.eval_shape(lambda task=task: experiment.network.init(key, task.observe(task.reset(key))))
+        if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape, params):
+            raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
+
+    @jax.jit
+    def play(params: Any, task: Any) -> dict[str, Any]:
+        policy: Any = functools.partial(experiment.network.apply, params, method="policy")
+        return rollout.evaluate(key, task, policy, asked["episodes"])
+
+    results = [
+        {"changed": dict(pairs), "task": task, "metrics": {name: float(x) for name, x in play(params, b).items()}}
+        for pairs, task, b in zip(changes, tasks, built, strict=True)
+    ]
+    found = {"update": restored.update, "score_in_training": restored.score, "device": jax.devices()[0].device_kind}
+    return asked | found | {"results": results}
+
+
+def _report(run_dir: Path, result: dict[str, Any]) -> int:
+    from jaxswarm.checkpoint import replace_text  # noqa: PLC0415
+
+    name = f"eval-{result['which']}-{time.strftime('%Y%m%d-%H%M%S')}"
+    while (path := run_dir / f"{name}.json").exists():
+        name += "x"
+    replace_text(path, json.dumps(result, indent=2) + "\n")
+    print(f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes")
+    print(_table(result["results"]))
+    print(f"wrote {path}")
+    return 0
+
+
+def _table(results: Sequence[dict[str, Any]]) -> str:
+    """A row per metric, returns first; a column per changed task."""
+    metrics = sorted(results[0]["metrics"], key=lambda name: not name.startswith("return"))
+    rows = [[key, *[str(result["changed"][key]) for result in results]] for key in results[0]["changed"]]
+    rows += [[name, *[f"{result['metrics'][name]:.4f}" for result in results]] for name in metrics]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = [[x.rjust(width) for x, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(["", row[0].ljust(widths[0]), *line[1:]]) for row, line in zip(rows, cells, strict=True))

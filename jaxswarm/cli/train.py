@@ -1,0 +1,137 @@
+"""The program `jaxswarm-train`."""
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxswarm import config as configs
+from jaxswarm.cli.words import command, load, only, program, resume_command, split, use_compile_cache, wants_help
+from jaxswarm.config import Config, ConfigError
+
+HELP = """\
+jaxswarm-train [group=choice | key=value] ... [run_dir=PATH]
+jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
+
+Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, checkpoints.
+Ctrl-C or SIGTERM ends it after a checkpoint; resume=PATH continues it exactly where its last checkpoint stands.
+
+examples
+  jaxswarm-train
+  jaxswarm-train aggregator=bayesian learner.learning_rate=3e-4 task.num_agents=10 seed=3
+  jaxswarm-train experiment=rendezvous_thesis run_dir=runs/thesis
+  jaxswarm-train resume=runs/thesis num_updates=320
+"""
+
+
+@program
+def main(arguments: Sequence[str]) -> int:
+    """Trains, or continues a run; returns the exit code."""
+    if wants_help(arguments):
+        print(HELP + "\n" + _keys_help())
+        return 0
+    paths, words = split(arguments, ("run_dir", "resume"))
+    if "resume" in paths:
+        if "run_dir" in paths:
+            raise ConfigError("give one of run_dir and resume")
+        return _resume(Path(paths["resume"]), words)
+    config = configs.compose(words)
+    run_dir = Path(paths.get("run_dir") or _default_run_dir(config))
+    if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+        hint = f"continue it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
+        raise ConfigError(f"run_dir={run_dir} exists and is not empty; {hint}, or choose another folder")
+    return _fit(config, run_dir, is_resumed=False)
+
+
+def _resume(run_dir: Path, words: Sequence[str]) -> int:
+    config = load(run_dir)
+    pairs = configs.parse(words)
+    only(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
+    extended = configs.override(config, pairs)
+    if pairs:
+        per_update = configs.build(config).agent_steps_per_update
+        before, after = (configs.run_settings(x).length(per_update) for x in (config, extended))
+        if after < before:
+            raise ConfigError(f"{pairs[0][0]} = {pairs[0][1]} is {after} updates; accepted: {before} updates or more")
+    return _fit(extended, run_dir, is_resumed=True)
+
+
+def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
+    run, experiment = configs.run_settings(config), configs.build(config)
+    num_updates = run.length(experiment.agent_steps_per_update)
+    use_compile_cache()
+    from jaxswarm.checkpoint import CheckpointError, replace_text  # noqa: PLC0415
+    from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
+
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        replace_text(run_dir / "config.yaml", configs.dump(config))
+    except OSError as error:
+        raise ConfigError(f"cannot write to {run_dir}: {error.strerror}") from error
+    print(_summary(config, experiment, num_updates, run_dir), flush=True)
+    try:
+        train_state, rows = fit(
+            experiment,
+            num_updates,
+            seed=run.seed,
+            run_dir=run_dir,
+            resume=is_resumed,
+            checkpoint_seconds=run.checkpoint_seconds,
+            keep_checkpoints=run.keep_checkpoints,
+        )
+    except (DivergedError, CheckpointError) as error:
+        print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
+        return 1
+    update = int(train_state.update)
+    if update < num_updates:
+        print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
+        return 0
+    if rows:
+        print(f"done: {update} updates, return {rows[-1]['eval/return']:.2f} (untrained {rows[0]['eval/return']:.2f})")
+    print(f"{_files(run_dir)}\nnext: {command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
+    return 0
+
+
+def _keys_help() -> str:
+    """Groups with the first comment of each file, and the other keys as the main file documents them."""
+    lines = ["groups (* default)"]
+    main = (configs.config_dir() / "train.yaml").read_text()
+    for group, names in configs.choices().items():
+        for name in names:
+            text = (configs.config_dir() / group / f"{name}.yaml").read_text()
+            comments = (line[2:] for line in text.splitlines() if line.startswith("# ") and not line.startswith("# @"))
+            mark = "*" if f"- {group}: {name}\n" in main else " "
+            lines.append(f"  {mark} {f'{group}={name}':<30} {next(comments, '')}")
+    keys = main[main.index("_self_") :].split("\n", 2)[2].strip().splitlines()
+    lines += ["", "keys (and those of each group, as task.num_agents=50)"]
+    return "\n".join(lines + [f"  {line}" for line in keys])
+
+
+def _default_run_dir(config: Config) -> str:
+    names = "-".join(config[part]["name"] for part in ("task", "aggregator", "learner"))
+    path = base = f"runs/{names}-{time.strftime('%Y%m%d-%H%M%S')}"
+    number = 2
+    while Path(path).exists():
+        path, number = f"{base}-{number}", number + 1
+    return path
+
+
+def _summary(config: Config, experiment: Any, num_updates: int, run_dir: Path) -> str:
+    names = ", ".join(config[part]["name"] for part in ("task", "aggregator", "learner"))
+    per_update = experiment.agent_steps_per_update
+    return (
+        f"{names}: {experiment.task.num_agents} agents, {num_updates} updates of {per_update:,} agent steps "
+        f"({num_updates * per_update:,} in all), seed {config['seed']}\nrun folder: {run_dir}"
+    )
+
+
+def _files(run_dir: Path) -> str:
+    about = {
+        "curve.png": "learning curve",
+        "metrics.csv": "a row per evaluation",
+        "checkpoints": "the latest and the best state",
+        "config.yaml": "what was asked for",
+        "manifest.json": "versions, device, exact numbers of steps",
+    }
+    return "\n".join(f"  {run_dir / name!s:<50} {text}" for name, text in about.items() if (run_dir / name).exists())

@@ -1,0 +1,100 @@
+"""What the programs of the command line have in common: words in, exit codes and one line for every mistake out."""
+
+import functools
+import gc
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxswarm import config as configs
+from jaxswarm.config import Config, ConfigError
+
+
+def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | None], int]:
+    """Turns what users can mend into one line on stderr: 2 for a wrong command, 1 for a run that failed."""
+
+    @functools.wraps(main)
+    def program(arguments: Sequence[str] | None = None) -> int:
+        gc.set_threshold(200_000)  # importing and tracing make many objects and little garbage: a tenth of the start
+        try:
+            return main(sys.argv[1:] if arguments is None else arguments)
+        except ConfigError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("aborted", file=sys.stderr)
+            return 130
+
+    return program
+
+
+def wants_help(arguments: Sequence[str]) -> bool:
+    """Whether the user asks how to use the program."""
+    return any(word in ("-h", "--help", "help") for word in arguments)
+
+
+def split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """The program's own options, taken as they are written, and the other words."""
+    options, words = {}, []
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        if equals and name in names:
+            if not value:
+                raise ConfigError(f"{name} has no value")
+            options[name] = value
+        else:
+            words.append(word)
+    return options, words
+
+
+def only(pairs: Sequence[tuple[str, Any]], is_accepted: Callable[[str], bool], accepted: str) -> None:
+    """Raises a `ConfigError` for the first key that is not accepted."""
+    for key, _ in pairs:
+        if not is_accepted(key):
+            raise ConfigError(f"{key} cannot be changed here; accepted: {accepted}")
+
+
+def whole(name: str, value: Any, least: int) -> int:
+    """The value as an integer from `least`; a `ConfigError` for anything else."""
+    try:
+        number = int(value)
+    except ValueError:
+        number = least - 1
+    if not least <= number < 2**32:
+        raise ConfigError(f"{name} = {value} is not possible; accepted: integers from {least}")
+    return number
+
+
+def load(run_dir: Path) -> Config:
+    """The config of a run folder."""
+    if not (run_dir / "config.yaml").is_file():
+        raise ConfigError(f"{run_dir} is not a run folder: it has no config.yaml")
+    return configs.load(run_dir / "config.yaml")
+
+
+def use_compile_cache() -> None:
+    """Lets later starts find what was compiled before; has to come before anything is compiled."""
+    import jax  # noqa: PLC0415
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxswarm" / "xla"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def resume_command(run_dir: Path) -> str:
+    """What to type to continue a run."""
+    return command("jaxswarm-train", f"resume={run_dir}")
+
+
+def command(program: str, *words: str) -> str:
+    """What to type; with the folder of the program if it was called that way, from an environment not activated."""
+    folder = Path(sys.argv[0]).parent
+    if shutil.which(program) is None and (folder / program).exists():
+        program = str(folder / program)
+    return shlex.join([program, *words])
