@@ -218,8 +218,8 @@ class Pool(nn.Module):
         self, groups: tuple[Entities, ...], own: Float[Array, "receivers own_dim"] | None = None
     ) -> Float[Array, "receivers out"]:
         """Vectors of the receivers of groups with features [receivers, slots, dim]; `own` is what they know."""
-        is_monoid = isinstance(self.aggregator, Monoid)
-        layout = self.layout or (_FASTEST[self.aggregator.reduction] if is_monoid else "dense")
+        streams = isinstance(self.aggregator, Monoid) and self.aggregator.num_encoders > 0
+        layout = self.layout or (_FASTEST[self.aggregator.reduction] if streams else "dense")
         num_receivers = groups[0].mask.shape[0]
         groups = tuple(Entities(jnp.where(x.mask[..., None], x.features, 0.0), x.mask) for x in groups)
         num_pieces = max(-(-num_receivers // self._piece_size(layout, groups)), 1)
