@@ -32,9 +32,10 @@ class ConfigError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a config says beyond the experiment. Of `num_updates` and `total_agent_steps`, one is given."""
+    """What a config says beyond the experiment; of `num_updates` and `total_agent_steps`, one is given."""
 
     seed: int = 0
+    num_seeds: int = 1
     num_updates: int | None = None
     total_agent_steps: int | None = None
     checkpoint_seconds: float = 30.0
@@ -43,13 +44,18 @@ class Run:
     def __post_init__(self) -> None:
         if (self.num_updates is None) == (self.total_agent_steps is None):
             raise ConfigError("give one of num_updates and total_agent_steps")
-        least = {"seed": 0, "checkpoint_seconds": 0, "num_updates": 1, "total_agent_steps": 1, "keep_checkpoints": 1}
-        for name, bound in least.items():
-            value = getattr(self, name)
+        for field in dataclasses.fields(self):
+            name, value = field.name, getattr(self, field.name)
+            bound = 0 if name in ("seed", "checkpoint_seconds") else 1
             if value is not None and value < bound:
                 raise ConfigError(f"{name} = {value!r} is not possible; accepted: numbers from {bound}")
-        if self.seed >= 2**32:
+        if self.seed + self.num_seeds > 2**32:
             raise ConfigError(f"seed = {self.seed} is not possible; accepted: numbers below 2**32")
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Those that are trained side by side."""
+        return tuple(range(self.seed, self.seed + self.num_seeds))
 
     def length(self, agent_steps_per_update: int) -> int:
         """Number of updates; a last update that is only partly wanted is done in full."""

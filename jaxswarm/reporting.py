@@ -27,7 +27,7 @@ LEADING = ("update", "agent_steps", "wall_seconds", "seed", "eval/return", "eval
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal to draw a bar on
 
 
-def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
+def manifest(experiment: Any, num_updates: int, seeds: Sequence[int]) -> dict[str, Any]:
     """Versions, device, revision and the exact arithmetic of steps."""
     per_update = experiment.agent_steps_per_update
     steps = {
@@ -51,7 +51,7 @@ def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "command": sys.argv,
-        "seeds": [seed],
+        "seeds": list(seeds),
         "steps": steps,
     } | provenance()
 
@@ -188,6 +188,13 @@ class Progress:
             self._last_line = now
             done = f"update {update}/{self._num_updates}"
             print(f"{done} · return {return_text} · {rate_text} · {left_text}", flush=True)
+
+    def warn(self, text: str) -> None:
+        """Prints a line, above the bar if there is one."""
+        if self._bar:
+            self._bar.console.print(f"warning: {text}", markup=False, highlight=False)
+        elif self._is_shown:
+            print(f"warning: {text}", flush=True)
 
     def _make_bar(self) -> Any:
         from rich import console, progress  # noqa: PLC0415

@@ -13,10 +13,11 @@ from jaxswarm.cli.words import load, only, program, resume_command, split, use_c
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
-jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [task.key=value[,value...]] ...
+jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [train_seed=N] [task.key=value[,value...]] ...
 
 Evaluates the trained policy of a run folder, also on changed tasks: prints a table and writes JSON into the folder.
-The action is the mean of the policy; each episode is played in a world of its own.
+The action is the mean of the policy; each episode is played in a world of its own. Of a run with several seeds all
+policies are evaluated, or that of train_seed; the table has means over them, the file has each.
 
 examples
   jaxswarm-eval runs/thesis
@@ -31,7 +32,9 @@ def main(arguments: Sequence[str]) -> int:
         print(HELP)
         return 0 if arguments else 2
     paths = [word for word in arguments if "=" not in word]
-    options, words = split([word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed"))
+    options, words = split(
+        [word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed", "train_seed")
+    )
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
     which = options.get("checkpoint", "best")
@@ -42,7 +45,11 @@ def main(arguments: Sequence[str]) -> int:
     seed = whole("seed", options.get("seed", 0), 0)
     changes = configs.combinations(words)
     only(changes[0], lambda key: key.startswith("task."), "task.<field>=value")
-    asked = {"which": which, "seed": seed, "episodes": episodes}
+    trained = configs.run_settings(config).seeds
+    train_seeds = [whole("train_seed", options["train_seed"], 0)] if "train_seed" in options else list(trained)
+    if train_seeds[0] not in trained:
+        raise ConfigError(f"train_seed = {train_seeds[0]} is not possible; accepted: {trained[0]} to {trained[-1]}")
+    asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": train_seeds}
     result = _evaluate(Path(paths[0]), config, changes, asked)
     return _report(Path(paths[0]), result) if result else 1
 
@@ -51,11 +58,12 @@ def _evaluate(
     run_dir: Path, config: Config, changes: Sequence[Sequence[tuple[str, Any]]], asked: dict[str, Any]
 ) -> dict[str, Any] | None:
     """Plays the episodes of every changed task; `None` after saying that no checkpoint can be restored."""
-    experiment = configs.build(config)
+    experiment, trained = configs.build(config), configs.run_settings(config).seeds
     tasks = [configs.override(config, pairs)["task"] for pairs in changes]
     built = [configs.build_part("task", {"task": task}) for task in tasks]
     use_compile_cache()
     import jax  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
 
     from jaxswarm import rollout  # noqa: PLC0415
     from jaxswarm.checkpoint import CheckpointError, restore  # noqa: PLC0415
@@ -63,27 +71,34 @@ def _evaluate(
 
     warn = functools.partial(print, file=sys.stderr)
     try:
-        restored = restore(run_dir / "checkpoints", abstract_state(experiment), asked["which"], warn)
+        restored = restore(run_dir / "checkpoints", abstract_state(experiment, len(trained)), asked["which"], warn)
     except CheckpointError as error:
         warn(f"error: {error}")
         return None
     if restored is None:
         raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: {resume_command(run_dir)}")
     params, key = restored.train_state.learner.params, jax.random.key(asked["seed"])
+    wanted = np.array([trained.index(seed) for seed in asked["train_seeds"]])
+    params = jax.tree.map(lambda x: x[wanted], params)
     for task in built:
         needed = jax.eval_shape(lambda task=task: experiment.network.init(key, task.observe(task.reset(key))))
-        if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape, params):
+        if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape[1:], params):
             raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
 
     @jax.jit
     def play(params: Any, task: Any) -> dict[str, Any]:
-        policy: Any = functools.partial(experiment.network.apply, params, method="policy")
-        return rollout.evaluate(key, task, policy, asked["episodes"])
+        def episodes(params: Any) -> dict[str, Any]:
+            policy: Any = functools.partial(experiment.network.apply, params, method="policy")
+            return rollout.evaluate(key, task, policy, asked["episodes"])
 
-    results = [
-        {"changed": dict(pairs), "task": task, "metrics": {name: float(x) for name, x in play(params, b).items()}}
-        for pairs, task, b in zip(changes, tasks, built, strict=True)
-    ]
+        return jax.lax.map(episodes, params)
+
+    results = []
+    for pairs, task, with_leaves in zip(changes, tasks, built, strict=True):
+        of_seeds = {name: np.float64(x) for name, x in play(params, with_leaves).items()}
+        means = {name: float(x.mean()) for name, x in of_seeds.items()}
+        each = {name: x.tolist() for name, x in of_seeds.items()}
+        results.append({"changed": dict(pairs), "task": task, "metrics": means, "of_each_seed": each})
     found = {"update": restored.update, "score_in_training": restored.score, "device": jax.devices()[0].device_kind}
     return asked | found | {"results": results}
 
@@ -95,7 +110,11 @@ def _report(run_dir: Path, result: dict[str, Any]) -> int:
     while (path := run_dir / f"{name}.json").exists():
         name += "x"
     replace_text(path, json.dumps(result, indent=2) + "\n")
-    print(f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes")
+    num_seeds = len(result["train_seeds"])
+    seeds = f" of each of {num_seeds} seeds; means" if num_seeds > 1 else ""
+    print(
+        f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes{seeds}"
+    )
     print(_table(result["results"]))
     print(f"wrote {path}")
     return 0
