@@ -94,7 +94,12 @@ def compose(words: Sequence[str] = ()) -> Config:
 
 
 def load(path: Path) -> Config:
-    """The config of a run, as `save` wrote it."""
+    """The config of a run, as `dump` wrote it."""
+    return validate(read(path))
+
+
+def read(path: Path) -> Config:
+    """What a file says, be it the config of a run of another version."""
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     try:
@@ -103,7 +108,16 @@ def load(path: Path) -> Config:
         raise ConfigError(f"cannot read {path}: {error}") from error
     if not isinstance(config, dict):
         raise ConfigError(f"cannot read {path}: no keys in it")
-    return validate(typing.cast(Config, config))
+    return typing.cast(Config, config)
+
+
+def preset(group: str, choice: str) -> dict[str, Any]:
+    """The values of a choice, those of its defaults included."""
+    values = read(config_dir() / group / f"{choice}.yaml")
+    merged = {}
+    for default in values.pop("defaults", []):
+        merged |= preset(group, default)
+    return merged | values
 
 
 def dump(config: Config) -> str:

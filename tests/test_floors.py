@@ -23,11 +23,13 @@ FLOORS = [
     {"learners.ppo", "learners.trl"},
     {"learners"},
     {"training"},
-    {"config", "checkpoint"},
+    {"config", "checkpoint", "curves"},
+    {"plots"},
     {"reporting"},
+    {"runs", "loggers"},
     {"fit"},
     {"cli.words"},
-    {"cli.train", "cli.evaluate"},
+    {"cli.train", "cli.evaluate", "cli.plot"},
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
