@@ -97,7 +97,7 @@ def _load(package: str, extra: str) -> ModuleType:
         raise ConfigError(f'{extra} needs a package: pip install "jaxswarm[{extra}]"') from error
 
 
-def _numbers(row: Row) -> dict[str, float]:
+def _numbers(row: Row) -> Row:
     return {name: x for name, x in row.items() if name not in AXES and not math.isnan(x)}
 
 

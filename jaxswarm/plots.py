@@ -128,7 +128,8 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
     for number, series in enumerate(ours):
         style = {"color": COLORS[number % len(COLORS)], "linewidth": 1.8, "zorder": 4}
         every = max(1, len(series.line.x) // 12)
-        marks = {"marker": MARKERS[number % len(MARKERS)], "markersize": 4, "markevery": (number % every, every)}
+        marker = MARKERS[(number + number // len(COLORS)) % len(MARKERS)]  # another one when colours come again
+        marks = {"marker": marker, "markersize": 4, "markevery": (number % every, every)}
         style |= {"drawstyle": "steps-post"} if picture.is_step else marks
         _draw_line(axes, series, picture.is_step, 0.2, style)
     for number, series in enumerate(references):

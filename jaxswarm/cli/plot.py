@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import difflib
-import functools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -52,8 +51,6 @@ CHOICES = {
 REFERENCE_COLUMNS = ("series", "agent_steps", "median", "q25", "q75")
 NAMES = {"eval/return": "return of an episode"}
 UNITS = {"agent_steps": "agent steps", "wall_seconds": "seconds", "update": "updates"}
-
-_warn = functools.partial(print, file=sys.stderr)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,7 +200,7 @@ def _curve(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
     lines = {label: curves.summarize(seeds, options.statistic) for label, seeds in groups.items()}
     series = []
     for label, line in lines.items():
-        most, last = line.num_seeds.max(), line.num_seeds[-1]
+        most, last = int(line.num_seeds.max()), int(line.num_seeds[-1])
         series.append(Series(label, line, _count(most) + (f", {last} at the end" if last < most else "")))
     caption = f"{statistic.name} and {statistic.band} over seeds".capitalize()
     if any(np.ptp(line.num_seeds) for line in lines.values()):
@@ -232,7 +229,7 @@ def _threshold(groups: Mapping[str, Sequence[Curve]], options: Options) -> Pictu
         times, is_reached = curves.times_to(seeds, threshold)
         line = curves.reaching(seeds, threshold)
         half = line.x[line.y >= 0.5]
-        when = f"half by {_amount(half[0], options.x)}" if half.size else "half never"
+        when = f"half by {_amount(half[0], options.x)}" if half.size else "fewer than half"
         note = f"{is_reached.sum()} of {_count(len(seeds))}, {when}"
         series.append(Series(label, line, note, censored=np.sort(times[~is_reached])))
     fraction = f"fraction of seeds that reached {options.threshold}"
@@ -257,13 +254,17 @@ def _write(out: Path, picture: Picture) -> None:
     if "x" in picture.log:
         hidden = sum(int((series.line.x <= 0).sum()) for series in picture.series)
         if hidden:
-            _warn(f"{hidden} points at {picture.x_name} = 0 are not drawn, a logarithmic axis has no place for them")
+            _warn(f"a logarithmic axis has no place for {picture.x_name} = 0; points left out: {hidden}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         replace_text(out.with_suffix(".csv"), plots.table(picture))
         plots.draw(out, picture)
     except OSError as error:
         raise ConfigError(f"cannot write to {out.parent}: {error.strerror}") from error
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def _shared_name(groups: Mapping[str, Sequence[RunFolder]]) -> str:
