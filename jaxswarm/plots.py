@@ -130,7 +130,7 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
         every = max(1, len(series.line.x) // 12)
         marker = MARKERS[(number + number // len(COLORS)) % len(MARKERS)]  # another one when colours come again
         marks = {"marker": marker, "markersize": 4, "markevery": (number % every, every)}
-        style |= {"drawstyle": "steps-post"} if picture.is_step else marks
+        style |= marks | ({"drawstyle": "steps-post"} if picture.is_step else {})
         _draw_line(axes, series, picture.is_step, 0.2, style)
     for number, series in enumerate(references):
         color = _tint(COLORS[(len(ours) + number) % len(COLORS)])

@@ -128,9 +128,10 @@ def draw_curve(path: Path, rows: Sequence[Row], title: str) -> None:
         line, what = curves.summarize(list(seeds.values()), "median"), f"median and quartiles of {len(seeds)} seeds"
     else:
         line, what = _mean_over_episodes(rows), "mean ± std"
-    series = plots.Series("", line)
     label = f"return of an episode ({what})"
-    plots.draw(path, plots.Picture("curve", [series], "agent_steps", RETURN, label, title=title))
+    caption = "pale where some seeds have no evaluation" if np.unique(line.num_seeds).size > 1 else ""
+    series = [plots.Series("", line)]
+    plots.draw(path, plots.Picture("curve", series, "agent_steps", RETURN, label, title=title, caption=caption))
 
 
 def _mean_over_episodes(rows: Sequence[Row]) -> curves.Line:
