@@ -7,6 +7,7 @@ linearly, outside of them it is not counted, so that the number of seeds behind 
 import dataclasses
 import math
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -55,15 +56,17 @@ def from_rows(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> tuple[dict[i
     A seed without a finite evaluation has no curve. What is measured in training has no value in a seed's first row,
     before the first update: that is not counted.
     """
+    points = defaultdict(list)
+    for row in rows:
+        points[row["seed"]].append((row.get(x, math.nan), row.get(y, math.nan)))
     curves, num_left_out = {}, 0
-    for seed in sorted({row["seed"] for row in rows}):
-        mine = [row for row in rows if row["seed"] == seed]
-        points = np.array([[row[x], row.get(y, math.nan)] for row in mine], float)
-        is_finite = np.all(np.isfinite(points), axis=1)
+    for seed in sorted(points):
+        mine = np.array(points[seed], float)
+        is_finite = np.all(np.isfinite(mine), axis=1)
         num_left_out += np.count_nonzero(~is_finite[0 if y.startswith("eval/") else 1 :])
         if is_finite.any():
-            at, last = np.unique(points[is_finite, 0][::-1], return_index=True)
-            curves[seed] = Curve(at, points[is_finite, 1][::-1][last])
+            at, last = np.unique(mine[is_finite, 0][::-1], return_index=True)
+            curves[seed] = Curve(at, mine[is_finite, 1][::-1][last])
     return curves, int(num_left_out)
 
 

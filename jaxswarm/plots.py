@@ -27,6 +27,12 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = ((0, (5, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (9, 2)), (0, (1, 1.2)))  # of references
 FORMATS = ("png", "svg", "pdf")
 COLUMNS = ("kind", "series", "num_seeds", "x_name", "x", "y_name", "y", "lower", "upper")
+SETTINGS: Any = {  # the same picture is the same file; its words stay words, whatever is in them
+    "svg.hashsalt": "jaxswarm",
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
+    "text.parse_math": False,
+}
 LEGEND_INSIDE = 4  # longer legends are put below the axes, as are those of step lines, which fill all of them
 LINE_LENGTH = 104  # characters of small text that a picture has room for
 UNITS = {  # of an axis: what from which value on
@@ -66,7 +72,7 @@ def draw(path: Path, picture: Picture) -> None:
     from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    with rc_context({"svg.hashsalt": "jaxswarm", "svg.fonttype": "none", "pdf.fonttype": 42}):
+    with rc_context(rc=SETTINGS):
         figure = Figure(figsize=(7, 4.4), layout="constrained")
         axes = figure.subplots()
         shown = _in_units(picture)
@@ -76,7 +82,7 @@ def draw(path: Path, picture: Picture) -> None:
         _draw_legend(figure, axes, textwrap.fill(picture.caption, LINE_LENGTH), is_inside)
         temporary = path.with_name(f".{path.name}.tmp")
         try:
-            figure.savefig(temporary, dpi=180, format=path.suffix[1:])
+            figure.savefig(temporary, dpi=180, format=path.suffix[1:].lower())
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

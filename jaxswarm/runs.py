@@ -8,7 +8,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,9 +101,9 @@ def seeds(folders: Sequence[RunFolder], x: str, y: str, warn: Callable[[str], ob
     """A curve for each seed of a group.
 
     A seed that two folders hold with the same numbers, as a copy or a longer run does, counts once. What is left out,
-    and a seed that occurs with different numbers, is told to `warn`, one line each.
+    and seeds that occur more than once, are told to `warn`, one line each.
     """
-    kept: dict[int, list[tuple[Curve, Curve]]] = defaultdict(list)  # by update to compare, by x to return
+    kept: dict[int, list[_Seed]] = defaultdict(list)
     for folder in folders:
         mine, num_left_out = curves.from_rows(folder.rows, x, y)
         if num_left_out:
@@ -113,23 +113,33 @@ def seeds(folders: Sequence[RunFolder], x: str, y: str, warn: Callable[[str], ob
             numbers = f"seed {', '.join(map(str, absent))}" if absent else "the run"
             warn(f"{folder.path}: {numbers} not counted, there is no finite {y}")
         by_update, _ = curves.from_rows(folder.rows, "update", y)
-        for seed, curve in mine.items():
-            _keep(kept[seed], by_update[seed], curve)
-    for seed, several in kept.items():
+        for number, curve in mine.items():
+            seed = _Seed(folder.path, by_update[number], curve)
+            same = next((i for i, other in enumerate(kept[number]) if seed.is_same(other)), None)
+            if same is None:
+                kept[number].append(seed)
+                continue
+            other = kept[number][same]
+            warn(f"{folder.path}: seed {number} is that of {other.path}; the longer one is counted")
+            kept[number][same] = max(other, seed, key=lambda one: one.by_update.x[-1])
+    for number, several in kept.items():
         if len(several) > 1:
-            warn(f"seed {seed} occurs {len(several)} times with different numbers; each is counted")
-    return [curve for several in kept.values() for _, curve in several]
+            names = ", ".join(str(seed.path) for seed in several)
+            warn(f"seed {number} occurs {len(several)} times with different numbers, each is counted: {names}")
+    return [seed.curve for several in kept.values() for seed in several]
 
 
-def _keep(several: list[tuple[Curve, Curve]], by_update: Curve, curve: Curve) -> None:
-    """Adds a seed's curve, or replaces the one that it continues."""
-    for number, (other, _) in enumerate(several):
-        _, mine, others = np.intersect1d(by_update.x, other.x, return_indices=True)
-        if mine.size and np.array_equal(by_update.y[mine], other.y[others]):
-            if by_update.x[-1] > other.x[-1]:
-                several[number] = (by_update, curve)
-            return
-    several.append((by_update, curve))
+class _Seed(NamedTuple):
+    """A seed of a folder: over updates, for comparison, and over what is asked for."""
+
+    path: Path
+    by_update: Curve
+    curve: Curve
+
+    def is_same(self, other: "_Seed") -> bool:
+        """Whether all that both evaluated agrees."""
+        _, mine, others = np.intersect1d(self.by_update.x, other.by_update.x, return_indices=True)
+        return mine.size > 0 and np.array_equal(self.by_update.y[mine], other.by_update.y[others])
 
 
 def _run_folders(path: Path) -> Iterator[Path]:

@@ -89,7 +89,9 @@ def test_the_table_holds_what_is_drawn(runs):
     np.testing.assert_allclose(values, [np.percentile(x, [25, 50, 75]) for x in there])
 
 
-@pytest.mark.parametrize(("name", "start"), [("x.png", b"\x89PNG"), ("x.svg", b"<?xml"), ("a.b.pdf", b"%PDF")])
+@pytest.mark.parametrize(
+    ("name", "start"), [("x.png", b"\x89PNG"), ("x.svg", b"<?xml"), ("a.b.pdf", b"%PDF"), ("X.PNG", b"\x89PNG")]
+)
 def test_the_suffix_is_the_format(runs, tmp_path, name, start):
     assert plot.main([str(runs / "mean"), f"out={name}"]) == 0
     path = tmp_path / name
@@ -105,11 +107,11 @@ def test_a_previous_picture_is_replaced(runs, tmp_path):
 
 
 def test_the_interquartile_mean_over_the_time_with_logarithmic_axes(runs, capsys):
-    words = ["statistic=iqm", "x=wall_seconds", "log=xy", "smooth=2", "title=What is seen"]
+    words = ["statistic=iqm", "x=wall_seconds", "log=xy", "smooth=2", "title=What $ is_seen"]
     assert plot.main([str(runs), *words, "out=x.svg"]) == 0
     assert "no place for wall_seconds = 0; points left out: 1" in capsys.readouterr().err
     words = text_of("x.svg")
-    expected = ["What is seen", "95 % stratified bootstrap interval", "means of 2 evaluations", "seconds"]
+    expected = ["What $ is_seen", "95 % stratified bootstrap interval", "means of 2 evaluations", "seconds"]
     assert all(text in words for text in expected), words
     assert "rendezvous" not in words
     rows = [row for row in read("x.csv") if row["series"] == "aggregator=max"]
@@ -158,7 +160,9 @@ def test_references_are_drawn_with_their_source(runs, reference):
         ("4", "0.0", "-8.0", "-9.0"),
         ("4", "900.0", "-1.0", ""),
     ]
-    assert "A (small) (figure, 4 runs)" in text_of("x.svg")
+    words = text_of("x.svg")
+    assert "A (small) (figure, 4 runs)" in words
+    assert "dashed: references, median and quartiles" in words
 
 
 @pytest.mark.parametrize(
@@ -172,6 +176,7 @@ def test_references_are_drawn_with_their_source(runs, reference):
         (["log=z"], ["log = 'z'", "x, y, xy"]),
         (["log=y", "y=update"], ["log = y is not possible", "0 to 2"]),
         (["log=y", "kind=profile"], ["log = y is not possible with kind=profile"]),
+        (["kind=profile", "statistic=iqm"], ["statistic = iqm has no meaning here"]),
         (["smooth=0"], ["smooth = 0", "integers from 1"]),
         (["kind=threshold"], ["threshold = ''", "threshold=-30"]),
         (["threshold=3"], ["kind=threshold"]),

@@ -121,8 +121,11 @@ def test_copies_and_continued_runs_count_once(write, tmp_path):
     for name, returns in (("a", [1.0, 2.0]), ("b", [1.0, 2.0, 3.0]), ("c", [1.0])):
         write(name, {0: returns})
     (members,) = group(tmp_path).values()
-    (curve,) = runs.seeds(members, "agent_steps", "eval/return", pytest.fail)
+    told = []
+    (curve,) = runs.seeds(members, "agent_steps", "eval/return", told.append)
     assert curve.y.tolist() == [1, 2, 3]
+    names = [(tmp_path / name, tmp_path / other) for name, other in (("b", "a"), ("c", "b"))]
+    assert told == [f"{name}: seed 0 is that of {other}; the longer one is counted" for name, other in names]
 
 
 def test_what_is_not_counted_is_told(write, tmp_path):

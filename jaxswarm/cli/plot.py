@@ -42,12 +42,6 @@ examples
   jaxswarm-plot runs/a runs/b out=figure.pdf statistic=iqm log=x
   jaxswarm-plot runs kind=threshold threshold=-30 x=wall_seconds
 """
-CHOICES = {
-    "kind": ("curve", "profile", "threshold"),
-    "statistic": tuple(STATISTICS),
-    "x": ("agent_steps", "wall_seconds", "update"),
-    "log": ("", "x", "y", "xy"),
-}
 REFERENCE_COLUMNS = ("series", "agent_steps", "median", "q25", "q75")
 NAMES = {"eval/return": "return of an episode"}
 UNITS = {"agent_steps": "agent steps", "wall_seconds": "seconds", "update": "updates"}
@@ -79,6 +73,8 @@ class Options:
             raise ConfigError(f"threshold = {self.threshold!r} is not possible; accepted: a number, like threshold=-30")
         if self.threshold and self.kind != "threshold":
             raise ConfigError(f"threshold = {self.threshold} has no meaning here; accepted with kind=threshold")
+        if self.statistic != Options.statistic and self.kind != "curve":
+            raise ConfigError(f"statistic = {self.statistic} has no meaning here; accepted with kind=curve")
         if self.reference and (self.kind, self.x) != ("curve", "agent_steps"):
             raise ConfigError("reference has no meaning here; accepted with kind=curve and x=agent_steps")
         if self.series and not self.reference:
@@ -99,7 +95,9 @@ def main(arguments: Sequence[str]) -> int:
     groups = _groups([runs.read(path) for path in runs.find(paths)], options)
     title = options.title or (_shared_name(groups) if len(groups) > 1 else "")
     picture = KINDS[options.kind](_seeds(groups, options), options)
-    picture = dataclasses.replace(picture, series=[*picture.series, *references], title=title, log=options.log)
+    caption = picture.caption + ("; dashed: references, median and quartiles" if references else "")
+    series = [*picture.series, *references]
+    picture = dataclasses.replace(picture, series=series, title=title, caption=caption, log=options.log)
     _write(out, picture)
     for series in picture.series:
         if not series.is_reference:
@@ -132,7 +130,7 @@ def _output(out: str) -> Path:
     """Where the picture goes; a `ConfigError` if that, or the table beside it, would replace something else."""
     path = Path(out or "plot.png")
     table = path.with_suffix(".csv")
-    if path.suffix[1:] not in plots.FORMATS:
+    if path.suffix[1:].lower() not in plots.FORMATS:
         raise ConfigError(f"out = {out!r} is not possible; accepted: {', '.join(f'FILE.{x}' for x in plots.FORMATS)}")
     if path.is_dir() or table.is_dir():
         raise ConfigError(f"out = {out!r} is not possible: there is a folder of that name")
@@ -149,8 +147,10 @@ def _reference(path: Path, options: Options) -> list[Series]:
     try:
         with open(path, encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read reference={path}: {getattr(error, 'strerror', error)}") from error
+    except OSError as error:
+        raise ConfigError(f"cannot read reference={path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"cannot read reference={path}: {error}") from error
     missing = [name for name in REFERENCE_COLUMNS if not rows or name not in rows[0]]
     if missing:
         raise ConfigError(f"reference={path} has no column {missing[0]}; it needs {', '.join(REFERENCE_COLUMNS)}")
@@ -169,6 +169,8 @@ def _reference_series(path: Path, name: str, rows: Sequence[Mapping[str, str]]) 
         raise ConfigError(f"cannot read reference={path}: {error}") from error
     source = f"{path.stem}, {num_runs[0]} runs" if num_runs[0] else path.stem
     x, middle, lower, upper = np.array(table).T
+    if not np.isfinite(x).all():
+        raise ConfigError(f"cannot read reference={path}: agent_steps of {name!r} are not all numbers")
     return Series(name, Line(x, middle, lower, upper, np.array(num_runs)), source, is_reference=True)
 
 
@@ -243,6 +245,14 @@ KINDS: dict[str, Callable[[Mapping[str, Sequence[Curve]], Options], Picture]] = 
     "curve": _curve,
     "profile": _profile,
     "threshold": _threshold,
+}
+
+
+CHOICES = {
+    "kind": tuple(KINDS),
+    "statistic": tuple(STATISTICS),
+    "x": ("agent_steps", "wall_seconds", "update"),
+    "log": ("", "x", "y", "xy"),
 }
 
 
