@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = ((0, (5, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (9, 2)), (0, (1, 1.2)))  # of references
-FORMATS = ("png", "svg", "pdf")
+FORMATS: dict[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}  # and metadata
 COLUMNS = ("kind", "series", "num_seeds", "x_name", "x", "y_name", "y", "lower", "upper")
 SETTINGS: Any = {  # the same picture is the same file; its words stay words, whatever is in them
     "svg.hashsalt": "jaxswarm",
@@ -82,7 +82,8 @@ def draw(path: Path, picture: Picture) -> None:
         _draw_legend(figure, axes, textwrap.fill(picture.caption, LINE_LENGTH), is_inside)
         temporary = path.with_name(f".{path.name}.tmp")
         try:
-            figure.savefig(temporary, dpi=180, format=path.suffix[1:].lower())
+            suffix = path.suffix[1:].lower()
+            figure.savefig(temporary, dpi=180, format=suffix, metadata=FORMATS[suffix])
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

@@ -89,14 +89,22 @@ def test_the_table_holds_what_is_drawn(runs):
     np.testing.assert_allclose(values, [np.percentile(x, [25, 50, 75]) for x in there])
 
 
-@pytest.mark.parametrize(
-    ("name", "start"), [("x.png", b"\x89PNG"), ("x.svg", b"<?xml"), ("a.b.pdf", b"%PDF"), ("X.PNG", b"\x89PNG")]
-)
+@pytest.mark.parametrize(("name", "start"), [("X.PNG", b"\x89PNG"), ("x.svg", b"<?xml"), ("a.b.pdf", b"%PDF")])
 def test_the_suffix_is_the_format(runs, tmp_path, name, start):
     assert plot.main([str(runs / "mean"), f"out={name}"]) == 0
     path = tmp_path / name
     assert path.read_bytes().startswith(start)
     assert {x.name for x in tmp_path.iterdir()} == {name, path.with_suffix(".csv").name}
+
+
+@pytest.mark.parametrize("name", ["x.svg", "x.pdf"])
+def test_the_same_picture_is_the_same_file(runs, tmp_path, name):
+    files = []
+    for _ in range(2):
+        assert plot.main([str(runs), f"out={name}", "statistic=iqm"]) == 0
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1]
+    assert not [word for word in (b"CreationDate", b"<dc:date>") if word in files[0]]
 
 
 def test_a_previous_picture_is_replaced(runs, tmp_path):

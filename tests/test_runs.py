@@ -137,7 +137,8 @@ def test_what_is_not_counted_is_told(write, tmp_path):
     told = []
     found = runs.seeds(members, "update", "eval/return", told.append)
     assert [curve.y.tolist() for curve in found] == [[1, 5, 6], [1.5], [0]]
-    texts = ["2 evaluations left out", "seed 1 not counted", "empty: the run not counted", "seed 0 occurs 2 times"]
+    texts = ["2 evaluations left out", "seed 1 not counted", "seed 0 is that of", "empty: the run not counted"]
+    texts += [f"seed 0 occurs 2 times with different numbers, each is counted: {tmp_path / 'b'}, {tmp_path / 'c'}"]
     assert all(text in line for text, line in zip(texts, told, strict=True)), told
 
 
