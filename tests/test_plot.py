@@ -97,14 +97,13 @@ def test_the_suffix_is_the_format(runs, tmp_path, name, start):
     assert {x.name for x in tmp_path.iterdir()} == {name, path.with_suffix(".csv").name}
 
 
-@pytest.mark.parametrize("name", ["x.svg", "x.pdf"])
-def test_the_same_picture_is_the_same_file(runs, tmp_path, name):
+def test_the_same_picture_is_the_same_file(runs, tmp_path):
     files = []
     for _ in range(2):
-        assert plot.main([str(runs), f"out={name}", "statistic=iqm"]) == 0
-        files.append((tmp_path / name).read_bytes())
+        assert plot.main([str(runs), "out=x.svg", "statistic=iqm"]) == 0
+        files.append((tmp_path / "x.svg").read_text())
     assert files[0] == files[1]
-    assert not [word for word in (b"CreationDate", b"<dc:date>") if word in files[0]]
+    assert "<dc:date>" not in files[0]
 
 
 def test_a_previous_picture_is_replaced(runs, tmp_path):
@@ -245,5 +244,5 @@ def test_many_series_share_no_colour_and_marker():
     original = plots._draw_line
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plots, "_draw_line", lambda *words: (drawn.append(words[-1]), original(*words)))
-        plots.draw(plot.Path("many.png"), picture)
+        plots.draw(plot.Path("many.svg"), picture)
     assert len({(style["color"], style["marker"]) for style in drawn}) == 20
