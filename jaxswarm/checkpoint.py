@@ -105,7 +105,7 @@ def restore(
     template: Any,
     which: Literal["last", "best"] = "last",
     on_damage: Callable[[str], None] = print,
-    up_to: float = math.inf,
+    up_to: int | float = math.inf,
 ) -> Restored | None:
     """The last or the best checkpoint that is whole, of an update `up_to` some; `None` where none was ever written.
 

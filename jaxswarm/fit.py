@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxswarm import ensemble, reporting
+from jaxswarm import ensemble, loggers, reporting
 from jaxswarm.checkpoint import Restored, restore, set_aside_after
 from jaxswarm.ensemble import Batch
 from jaxswarm.recording import Recorder, Run, draw_curve
@@ -57,6 +57,8 @@ def fit(
     progress: bool = True,
     checkpoint_seconds: float = 30.0,
     keep_checkpoints: int = 3,
+    log_to: tuple[str, ...] = (),
+    config: Mapping[str, Any] | None = None,
 ) -> tuple[TrainState, list[Row]]:
     """Trains until `num_updates` updates are done, or until Ctrl-C or SIGTERM, after the current chunk.
 
@@ -65,13 +67,15 @@ def fit(
     row before. With `num_seeds` the seeds from `seed` on are trained side by side: the state has a leading axis, and
     there is a row for each. A seed whose numbers stop being finite stays as it was before.
 
+    `log_to` are names in `loggers.LOGGERS`, to which `config` is shown.
+
     With `run_dir` the folder gets `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and
     the best, at most every `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last
     checkpoint. Raises `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints
     but none can be restored, and `FileExistsError` for a folder with another run in it.
     """
     seeds = tuple(range(seed, seed + (num_seeds or 1)))
-    run = Run(experiment, seeds, None if run_dir is None else Path(run_dir))
+    run = Run(experiment, seeds, None if run_dir is None else Path(run_dir), log_to, config)
     states, (rows,) = fit_runs(
         [run],
         num_updates,
@@ -100,6 +104,8 @@ def fit_runs(
     for run in runs:
         if run.run_dir and not resume and (run.run_dir / "metrics.csv").exists():
             raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
+        for name in run.loggers:
+            loggers.load(name)
     restored = _restore(runs) if resume else None
     if restored and restored[0].update >= num_updates:
         if progress:

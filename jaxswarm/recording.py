@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxswarm import reporting
 from jaxswarm.checkpoint import Checkpoints, Restored
+from jaxswarm.loggers import LOGGERS, Logger
 from jaxswarm.reporting import Row
 from jaxswarm.training import Experiment, TrainState, is_loss
 
@@ -23,6 +24,8 @@ class Run:
     experiment: Experiment
     seeds: tuple[int, ...] = (0,)
     run_dir: Path | None = None
+    loggers: tuple[str, ...] = ()  # names in `LOGGERS`, which need a folder
+    config: Mapping[str, Any] | None = None  # what the loggers show of it
 
 
 @dataclasses.dataclass
@@ -47,6 +50,7 @@ class Recorder:
         self._start = restored.update if restored else 0
         self._keep_checkpoints = keep_checkpoints
         self._checkpoints: Checkpoints | None = None
+        self._loggers: dict[int, list[Logger]] = {}
         self._last: _Candidate | None = None
         self._best: _Candidate | None = None  # better than all on disk, and not yet there
 
@@ -59,6 +63,8 @@ class Recorder:
             reporting.write_manifest(run_dir / "manifest.json", manifest)
             self.rows = reporting.keep_rows_before(run_dir / "metrics.csv", self._start)
             self._checkpoints = Checkpoints(run_dir / "checkpoints", self._keep_checkpoints)
+            for seed in self.run.seeds:
+                self._loggers[seed] = [LOGGERS[name](run_dir, self.run.config, seed) for name in self.run.loggers]
 
     def close(self) -> None:
         """Waits for what is being written."""
@@ -67,6 +73,9 @@ class Recorder:
                 self._save(self._best)
             self._checkpoints.close()
             self._checkpoints = None
+        for logger in (x for loggers in self._loggers.values() for x in loggers):
+            logger.close()
+        self._loggers = {}
         if self.run.run_dir and self.rows:
             draw_curve(self.run, self.rows)
 
@@ -74,7 +83,6 @@ class Recorder:
         self, start: int, wall_seconds: float, metrics: dict[str, np.ndarray], states: TrainState | None
     ) -> None:
         """Metrics [seeds, updates] of the updates from `start` on; `states` before them, if they may be saved."""
-        self._note_diverged(start, metrics)
         evaluation = {name: x[:, 0] for name, x in metrics.items() if name.startswith("eval/")}
         training = {name: x for name, x in metrics.items() if name not in evaluation and name != "is_finite"}
         is_evaluated = start % self.run.experiment.eval_every == 0
@@ -86,6 +94,7 @@ class Recorder:
             self._consider(_Candidate(start, states, record, self._score(evaluation) if is_evaluated else None))
         for name, x in training.items():
             self._since_evaluation[name] = self._since_evaluation[name] + x.T.astype(float).tolist()
+        self._note_diverged(start, metrics)
 
     def finish(
         self, update: int, wall_seconds: float, states: TrainState, evaluation: dict[str, np.ndarray] | None
@@ -123,13 +132,11 @@ class Recorder:
         """Seeds that stay as they were before their numbers stopped being finite, for a `reason` each."""
         return list(self.reason)
 
-    def _is_finite(self) -> np.ndarray:
-        return np.array([seed not in self.reason for seed in self.run.seeds])
-
     def _score(self, evaluation: dict[str, np.ndarray]) -> float | None:
         """Mean return over the seeds that have not diverged."""
-        returns = evaluation[RETURN][self._is_finite()]
-        return float(returns.mean(dtype=float)) if returns.size else None
+        returns = [x for seed, x in zip(self.run.seeds, evaluation[RETURN], strict=True) if seed not in self.reason]
+        score = float(np.mean(returns, dtype=float)) if returns else math.nan
+        return score if math.isfinite(score) else None
 
     def _to_continue(self, wall_seconds: float) -> dict[str, Any]:
         diverged = {str(seed): reason for seed, reason in self.reason.items()}
@@ -138,7 +145,7 @@ class Recorder:
     def _add_rows(self, update: int, wall_seconds: float, evaluation: dict[str, np.ndarray]) -> None:
         """Evaluations of the policies at `update`, and means over the updates since the rows before."""
         for index, seed in enumerate(self.run.seeds):
-            if seed in self.reason:
+            if seed in self.reason or not np.isfinite(evaluation[RETURN][index]):
                 continue
             means = {name: _nanmean([x[index] for x in values]) for name, values in self._since_evaluation.items()}
             row = {
@@ -150,6 +157,8 @@ class Recorder:
             self.rows.append(row | {name: float(x[index]) for name, x in evaluation.items()} | means)
             if self.run.run_dir:
                 reporting.append_row(self.run.run_dir / "metrics.csv", self.rows[-1])
+            for logger in self._loggers.get(seed, []):
+                logger.log(self.rows[-1])
         self._since_evaluation = {name: [] for name in self._since_evaluation}
 
     def _consider(self, candidate: _Candidate) -> None:

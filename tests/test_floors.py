@@ -23,12 +23,14 @@ FLOORS = [
     {"learners.ppo", "learners.trl"},
     {"learners"},
     {"training"},
-    {"config", "checkpoint"},
-    {"reporting", "ensemble"},
+    {"config", "checkpoint", "curves", "ensemble"},
+    {"plots"},
+    {"reporting"},
+    {"runs", "loggers"},
     {"recording"},
     {"fit"},
     {"cli.words"},
-    {"cli.train", "cli.evaluate"},
+    {"cli.train", "cli.evaluate", "cli.plot"},
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

@@ -81,6 +81,8 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
             resume=is_resumed,
             checkpoint_seconds=run.checkpoint_seconds,
             keep_checkpoints=run.keep_checkpoints,
+            log_to=run.loggers,
+            config=config,
         )
     except (DivergedError, CheckpointError) as error:
         print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
