@@ -72,8 +72,13 @@ class Checkpoints:
     def _open(self) -> None:
         import orbax.checkpoint as ocp  # noqa: PLC0415
 
+        self._directory.mkdir(parents=True, exist_ok=True)
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=None, create=True, cleanup_tmp_directories=True, enable_async_checkpointing=False
+            max_to_keep=None,
+            create=False,
+            cleanup_tmp_directories=True,
+            enable_async_checkpointing=False,
+            multiprocessing_options=_alone(),
         )
         self._manager = ocp.CheckpointManager(self._directory, options=options)
 
@@ -157,10 +162,22 @@ def _restore(directory: Path, update: int, template: Any) -> Restored:
         changed = [name for name, digest in written.items() if found.get(name) != digest]
         if changed:
             raise ValueError(f"{changed[0]} is not as it was written")
-    with ocp.StandardCheckpointer() as reader:
+    with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
         arrays = reader.restore(path / "state")
     train_state = _from_arrays(arrays, record["key_impls"], template)
     return Restored(update, train_state, record["run"], record["score"])
+
+
+def _alone() -> Any:
+    """Orbax is not to wait for other processes: what they have was fetched, and they do not write."""
+    import orbax.checkpoint as ocp  # noqa: PLC0415
+
+    me = jax.process_index()
+    if jax.process_count() == 1:
+        return ocp.options.MultiprocessingOptions()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process_{me}"
+    )
 
 
 def _updates(directory: Path) -> list[int]:

@@ -23,6 +23,7 @@ Config = dict[str, Any]
 
 REGISTERED = ("task", "aggregator", "learner")  # groups whose files have a `name`
 PARTS = (*REGISTERED, "network")  # what an experiment is made of, one dict each
+SEARCHES = "search"  # the folder of search spaces, which are no part of a config
 LENGTHS = ("num_updates", "total_agent_steps")  # two ways to say the same
 
 
@@ -78,18 +79,22 @@ def config_dir() -> Path:
 
 def choices() -> dict[str, list[str]]:
     """Names of the groups, and of the files in each."""
-    groups = sorted(path for path in config_dir().iterdir() if path.is_dir())
+    groups = sorted(path for path in config_dir().iterdir() if path.is_dir() and path.name != SEARCHES)
     return {group.name: sorted(path.stem for path in group.glob("*.yaml")) for group in groups}
 
 
 def compose(words: Sequence[str] = ()) -> Config:
     """The config that `words` such as `learner=ppo` and `task.num_agents=50` ask for: checked, complete, plain data."""
+    return compose_pairs(parse(words))
+
+
+def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
+    """`compose` for keys and values."""
     from hydra import compose, initialize_config_dir  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     groups = choices()
-    pairs = parse(words)
     chosen = {key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and value is not None}
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):

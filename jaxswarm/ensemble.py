@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import psutil
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Int, UInt
+from jaxtyping import Array, UInt
 
 from jaxswarm.rollout import WORLDS_AXIS
 from jaxswarm.training import Experiment, TrainState, evaluate, init, train_chunk
@@ -27,7 +28,7 @@ RUNS_AXIS = "runs"
 CPU_WIDTH = 1  # runs side by side on a CPU, whose cache holds the activations of one; measured, see benchmarks/LOG.md
 MEMORY_SHARE = 0.9  # of what is free that a program may take
 
-Program = Callable[[Experiment, TrainState, Int[Array, ""]], tuple[TrainState, Metrics]]
+Program = Callable[[Experiment, TrainState, Any], tuple[TrainState, Metrics]]  # the last: how many updates
 
 
 class Batch(NamedTuple):
@@ -48,7 +49,7 @@ def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> Batch:
     structures = {jax.tree.structure(experiment) for experiment in experiments}
     if len(structures) > 1:
         raise ValueError("experiments differ in what fixes a program's shapes; accepted: such as differ in numbers")
-    stacked = [jnp.repeat(jnp.asarray(x, jnp.float32), num_seeds) for x in zip(*leaves, strict=True)]
+    stacked = [np.repeat(np.asarray(x, np.float32), num_seeds) for x in zip(*leaves, strict=True)]
     batch = jax.tree.unflatten(structures.pop(), stacked)
     return Batch(batch, make_mesh(len(experiments) * num_seeds, experiments[0].num_worlds))
 
@@ -75,24 +76,37 @@ def make_mesh(num_runs: int, num_worlds: int) -> Mesh | None:
 
 def place(batch: Batch, states: TrainState) -> TrainState:
     """The states where the batch is computed."""
-    mesh = batch.mesh
-    if mesh is None:
-        return jax.device_put(states)
-    by_run, by_world = (NamedSharding(mesh, spec) for spec in (P(RUNS_AXIS), P(RUNS_AXIS, WORLDS_AXIS)))
-    spread = jax.tree.map(lambda _: by_run, states)
-    spread = spread.replace(worlds=jax.tree.map(lambda _: by_world, states.worlds))
-    return jax.device_put(states, spread)
+    raw = jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x), states)
+    impls = jax.tree.map(lambda x: str(jax.random.key_impl(x)) if _is_key(x) else "", states)
+
+    def wrapped(raw: Any) -> TrainState:
+        return jax.tree.map(lambda x, impl: jax.random.wrap_key_data(x, impl=impl) if impl else x, raw, impls)
+
+    return jax.jit(wrapped, out_shardings=_shardings(batch.mesh, states))(raw)
 
 
 def init_batch(batch: Batch, seeds: Sequence[int]) -> TrainState:
     """States before the first update, one for each run; those of the same seeds alone, bit by bit."""
+    seeds_array = np.asarray(seeds, np.uint32)
+    shapes = jax.eval_shape(_start, batch.experiments, seeds_array)
+    return jax.jit(_start, out_shardings=_shardings(batch.mesh, shapes))(batch.experiments, seeds_array)
 
-    return place(batch, _start(batch.experiments, jnp.asarray(seeds, jnp.uint32)))
 
-
-@jax.jit
-def _start(experiments: Experiment, seeds: UInt[Array, " runs"]) -> TrainState:
+def _start(experiments: Experiment, seeds: UInt[Any, " runs"]) -> TrainState:
     return jax.lax.map(lambda run: init(run[0], jax.random.key(run[1])), (experiments, seeds))
+
+
+def _shardings(mesh: Mesh | None, states: TrainState) -> Any:
+    """Where the leaves of states are; `None`: on the one device."""
+    if mesh is None:
+        return None
+    by_run, by_world = (NamedSharding(mesh, spec) for spec in (P(RUNS_AXIS), P(RUNS_AXIS, WORLDS_AXIS)))
+    spread = jax.tree.map(lambda _: by_run, states)
+    return spread.replace(worlds=jax.tree.map(lambda _: by_world, states.worlds))
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[str], None]) -> Program:
@@ -101,7 +115,7 @@ def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[s
     width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
     while width > 1:
         with _on(batch):
-            program = _advance.lower(batch.experiments, states, jnp.int32(0), size, width, batch.mesh).compile()
+            program = _advance.lower(batch.experiments, states, np.int32(0), size, width, batch.mesh).compile()
         needed, free = _memory(program), _free_memory()
         if free is None or needed <= free:
             return program
@@ -112,7 +126,7 @@ def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[s
             f"{width} at a time"
         )
 
-    def program(experiments: Experiment, states: TrainState, num_updates: Array) -> tuple[TrainState, Metrics]:
+    def program(experiments: Experiment, states: TrainState, num_updates: Any) -> tuple[TrainState, Metrics]:
         with _on(batch):
             return _advance(experiments, states, num_updates, size, width, batch.mesh)
 
@@ -141,8 +155,12 @@ def fetch(batch: Batch, tree: Any) -> Any:
     """The tree on this process's own device, wherever its parts are; a call that all processes have to make."""
     if jax.process_count() == 1 or batch.mesh is None:
         return tree
-    everywhere = jax.jit(lambda x: x, out_shardings=NamedSharding(batch.mesh, P()))(tree)
-    return jax.tree.map(lambda x: x.addressable_data(0), everywhere)
+    everywhere = jax.jit(lambda x: x, out_shardings=NamedSharding(batch.mesh, P()))
+
+    def local(x: Array) -> Array:  # one after the other: processes have to communicate in the same order
+        return jax.block_until_ready(everywhere(x)).addressable_data(0)
+
+    return jax.tree.map(local, tree)
 
 
 def _on(batch: Batch) -> contextlib.AbstractContextManager:

@@ -106,13 +106,13 @@ def fit_runs(
             raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
         for name in run.loggers:
             loggers.load(name)
+    is_first = jax.process_index() == 0  # of several processes, only the first one writes and talks
     restored = _restore(runs) if resume else None
     if restored and restored[0].update >= num_updates:
-        if progress:
+        if progress and is_first:
             print(f"{runs[0].run_dir} is finished: {restored[0].update} of {num_updates} updates are done")
         return _joined(restored), [_finished_rows(run) for run in runs]
     batch = ensemble.make_batch([run.experiment for run in runs], len(runs[0].seeds))
-    is_first = jax.process_index() == 0  # of several processes, only the first one writes
     runs = runs if is_first else [Run(run.experiment, run.seeds) for run in runs]
     start = restored[0].update if restored else 0
     agent_steps = runs[0].experiment.agent_steps_per_update * batch.num_runs
@@ -148,7 +148,7 @@ def _train(states: TrainState, num_updates: int, desk: "_Desk", stop: threading.
             break
         is_wanted = desk.writes and (update % eval_every == 0 or is_due)
         before = _copy(states) if is_wanted else None
-        states, metrics = program(desk.batch.experiments, states, jnp.int32(length))
+        states, metrics = program(desk.batch.experiments, states, np.int32(length))
         if in_flight:
             desk.record(in_flight)
         else:
@@ -282,6 +282,7 @@ def _restore(runs: Sequence[Run]) -> list[Restored] | None:
         if min(updates) == max(updates) or min(updates) < 0:
             break
         up_to = min(updates)
+    _agreed(0)  # nobody still reads
     if jax.process_index() == 0:
         for run in runs:
             assert run.run_dir

@@ -51,10 +51,6 @@ def read(path: Path) -> RunFolder:
     nested = configs.read(path / "config.yaml")
     with contextlib.suppress(ConfigError):  # the config of another version stays as it is
         nested = configs.validate(nested)
-    config = {}
-    for key, value in nested.items():
-        fields = {f"{key}.{name}": x for name, x in value.items()} if isinstance(value, dict) else {key: value}
-        config |= {name: x for name, x in fields.items() if name not in NOT_COMPARED}
     try:
         rows = read_rows(path / "metrics.csv")
     except ValueError as error:
@@ -62,7 +58,16 @@ def read(path: Path) -> RunFolder:
     missing = [name for name in ("update", "agent_steps", "seed") if rows and name not in rows[0]]
     if missing:
         raise ConfigError(f"cannot read {path / 'metrics.csv'}: it has no column {missing[0]}")
-    return RunFolder(path, config, rows)
+    return RunFolder(path, fields(nested), rows)
+
+
+def fields(config: configs.Config) -> Fields:
+    """A config as `Fields`."""
+    flat = {}
+    for key, value in config.items():
+        parts = {f"{key}.{name}": x for name, x in value.items()} if isinstance(value, dict) else {key: value}
+        flat |= {name: x for name, x in parts.items() if name not in NOT_COMPARED}
+    return flat
 
 
 def group(folders: Sequence[RunFolder]) -> dict[str, list[RunFolder]]:

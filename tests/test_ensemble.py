@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 
@@ -139,7 +140,7 @@ assert dict(mesh.shape) == {"runs": int(sys.argv[2]), "worlds": int(sys.argv[3])
 np.savez(sys.argv[4], *map(np.asarray, jax.tree.leaves(states.learner.params)))
 """
 CONFIG = f"""
-import jax, jax.numpy as jnp
+import jax, numpy as np
 from jaxswarm import config, ensemble
 EXPERIMENT = config.build(config.compose({WORDS.split()!r}))
 def train(num_runs):
@@ -147,7 +148,7 @@ def train(num_runs):
     states = ensemble.init_batch(batch, range(5, 5 + num_runs))
     program = ensemble.compile_batch(batch, states, 3, print)
     for _ in range(4):
-        states, metrics = program(batch.experiments, states, jnp.int32(3))
+        states, metrics = program(batch.experiments, states, np.int32(3))
     assert all(len(x.sharding.device_set) == batch.mesh.size for x in jax.tree.leaves(states.worlds))
     return states, batch.mesh
 """
@@ -166,3 +167,33 @@ def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):
         expected = jax.tree.leaves(jaxswarm.train(EXPERIMENT, state, 12)[0].learner.params)
         for a, b in zip(np.load(found).values(), expected, strict=True):
             np.testing.assert_allclose(a[index], b, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_seeds", [2, 1])
+def test_two_processes_train_together_and_the_first_one_writes(num_seeds, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    words = [*WORDS.split(), f"num_seeds={num_seeds}", "seed=5", "num_updates=10", "checkpoint_seconds=0"]
+    run = "import sys; from jaxswarm.cli import train; sys.exit(train.main(sys.argv[1:]))"
+
+    def start(index, *words):
+        env = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": str(index)}
+        command = [sys.executable, "-c", run, *words]
+        return subprocess.Popen(command, cwd=tmp_path, env=os.environ | env, stdout=subprocess.PIPE, text=True)
+
+    for attempt in ([*words, "run_dir=run"], ["resume=run", "num_updates=12"]):
+        processes = [start(index, *attempt) for index in (0, 1)]
+        outputs = [process.communicate(timeout=200)[0] for process in processes]
+        assert [process.returncode for process in processes] == [0, 0]
+        assert "done: " in outputs[0]
+        assert [line for line in outputs[1].splitlines() if "Gloo" not in line] == []  # that library says hello
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    rows = reporting.read_rows(tmp_path / "run" / "metrics.csv")
+    _, expected = fit(EXPERIMENT, 12, seed=5, num_seeds=num_seeds, progress=False)
+    kept = [row for row in rows if row["update"] != 10]  # where the first session ended
+    assert [(row["update"], row["seed"]) for row in kept] == [(row["update"], row["seed"]) for row in expected]
+    np.testing.assert_allclose(
+        [row["eval/return"] for row in kept], [row["eval/return"] for row in expected], rtol=1e-5
+    )

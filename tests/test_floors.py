@@ -29,8 +29,10 @@ FLOORS = [
     {"runs", "loggers"},
     {"recording"},
     {"fit"},
+    {"sweep", "search"},
     {"cli.words"},
     {"cli.train", "cli.evaluate", "cli.plot"},
+    {"cli.sweep"},
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

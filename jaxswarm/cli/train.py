@@ -1,5 +1,7 @@
 """The program `jaxswarm-train`."""
 
+import contextlib
+import io
 import sys
 import time
 from collections.abc import Sequence
@@ -7,7 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.words import command, load, only, program, resume_command, split, use_compile_cache, wants_help
+from jaxswarm.cli.words import (
+    command,
+    join_processes,
+    load,
+    only,
+    program,
+    resume_command,
+    split,
+    use_compile_cache,
+    use_cores,
+    wants_help,
+)
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
@@ -16,6 +29,8 @@ jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
 
 Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, checkpoints.
 Ctrl-C or SIGTERM ends it after a checkpoint; resume=PATH continues it exactly where its last checkpoint stands.
+Several processes, on one machine or more, train together if each runs the same command with JAX_COORDINATOR_ADDRESS,
+JAX_NUM_PROCESSES and JAX_PROCESS_ID set; the first one writes.
 
 examples
   jaxswarm-train
@@ -32,20 +47,27 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments):
         print(HELP + "\n" + _keys_help())
         return 0
+    if join_processes():
+        return _train(arguments, is_first=True)
+    with contextlib.redirect_stdout(io.StringIO()):
+        return _train(arguments, is_first=False)
+
+
+def _train(arguments: Sequence[str], is_first: bool) -> int:
     paths, words = split(arguments, ("run_dir", "resume"))
     if "resume" in paths:
         if "run_dir" in paths:
             raise ConfigError("give one of run_dir and resume")
-        return _resume(Path(paths["resume"]), words)
+        return _resume(Path(paths["resume"]), words, is_first)
     config = configs.compose(words)
     run_dir = Path(paths.get("run_dir") or _default_run_dir(config))
-    if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+    if is_first and run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
         hint = f"continue it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
         raise ConfigError(f"run_dir={run_dir} exists and is not empty; {hint}, or choose another folder")
-    return _fit(config, run_dir, is_resumed=False)
+    return _fit(config, run_dir, is_resumed=False, is_first=is_first)
 
 
-def _resume(run_dir: Path, words: Sequence[str]) -> int:
+def _resume(run_dir: Path, words: Sequence[str], is_first: bool) -> int:
     config = load(run_dir)
     pairs = configs.parse(words)
     only(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
@@ -55,19 +77,21 @@ def _resume(run_dir: Path, words: Sequence[str]) -> int:
         before, after = (configs.run_settings(x).length(per_update) for x in (config, extended))
         if after < before:
             raise ConfigError(f"{pairs[0][0]} = {pairs[0][1]} is {after} updates; accepted: {before} updates or more")
-    return _fit(extended, run_dir, is_resumed=True)
+    return _fit(extended, run_dir, is_resumed=True, is_first=is_first)
 
 
-def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
+def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int:
     run, experiment = configs.run_settings(config), configs.build(config)
     num_updates = run.length(experiment.agent_steps_per_update)
     use_compile_cache()
+    use_cores(run.num_seeds)
     from jaxswarm.checkpoint import CheckpointError, replace_text  # noqa: PLC0415
     from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
 
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        replace_text(run_dir / "config.yaml", configs.dump(config))
+        if is_first:
+            run_dir.mkdir(parents=True, exist_ok=True)
+            replace_text(run_dir / "config.yaml", configs.dump(config))
     except OSError as error:
         raise ConfigError(f"cannot write to {run_dir}: {error.strerror}") from error
     print(_summary(config, experiment, num_updates, run_dir), flush=True)

@@ -87,6 +87,35 @@ def use_compile_cache() -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def join_processes() -> bool:
+    """Joins the other processes of this training, if there are any; whether this is the one that writes and talks.
+
+    Each of them runs the same command, with JAX_COORDINATOR_ADDRESS=HOST:PORT, JAX_NUM_PROCESSES and JAX_PROCESS_ID.
+    """
+    if "JAX_COORDINATOR_ADDRESS" not in os.environ:
+        return True
+    import jax  # noqa: PLC0415
+
+    numbers = [os.environ.get(name) for name in ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")]
+    number, index = (None if x is None else whole("JAX_...", x, 0) for x in numbers)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)  # processes have to communicate in the same order
+    jax.distributed.initialize(num_processes=number, process_id=index)
+    return jax.process_index() == 0
+
+
+def use_cores(num_runs: int) -> None:
+    """Makes each core of a CPU a device that trains runs of its own; has to come before any device is used.
+
+    Two cores then train two runs in half the time that both take for one after the other; see benchmarks/LOG.md.
+    """
+    import jax  # noqa: PLC0415
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    is_decided = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not is_decided and "JAX_COORDINATOR_ADDRESS" not in os.environ:
+        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
+
+
 def resume_command(run_dir: Path) -> str:
     """What to type to continue a run."""
     return command("jaxswarm-train", f"resume={run_dir}")

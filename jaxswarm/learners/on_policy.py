@@ -59,17 +59,27 @@ def check(learner: OnPolicy) -> None:
 
 def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
     """Samples per gradient step; a `ValueError` says which sizes are possible if the one asked for is not."""
-    asked, unit = learner.batch_size, 1 if learner.minibatch == "agents" else num_agents
-    if asked and num_samples % asked == 0 and asked % unit == 0:
-        return asked
-    possible = [n for n in range(unit, num_samples + 1, unit) if num_samples % n == 0 and n > 1]
-    nearest = sorted(possible, key=lambda n: abs(n - (asked or USUAL_BATCH_SIZE)))[:4]
-    if asked is None:
+    asked = learner.batch_size
+    nearest = nearest_batch_sizes(learner, num_samples, num_agents)
+    if asked is None or asked == nearest[0]:
         return nearest[0]
+    unit = _unit(learner, num_agents)
     raise ValueError(
         f"batch_size = {asked} is not possible; accepted: divisors of num_worlds * num_steps * num_agents = "
-        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest)))}"
+        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest[:4])))}"
     )
+
+
+def nearest_batch_sizes(learner: OnPolicy, num_samples: int, num_agents: int) -> list[int]:
+    """All that are possible, the one nearest to the learner's or to the usual one first."""
+    unit = _unit(learner, num_agents)
+    possible = [n for n in range(unit, num_samples + 1, unit) if num_samples % n == 0 and n > 1]
+    return sorted(possible, key=lambda n: abs(n - (learner.batch_size or USUAL_BATCH_SIZE)))
+
+
+def _unit(learner: OnPolicy, num_agents: int) -> int:
+    """Samples that a minibatch has or has not as a whole."""
+    return 1 if learner.minibatch == "agents" else num_agents
 
 
 @pytree

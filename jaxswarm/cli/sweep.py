@@ -1,0 +1,134 @@
+"""The program `jaxswarm-sweep`."""
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxswarm import config as configs
+from jaxswarm.cli import plot
+from jaxswarm.cli.words import command, program, split, use_compile_cache, use_cores, wants_help, whole
+from jaxswarm.config import ConfigError
+
+HELP = """\
+jaxswarm-sweep key=a,b,c [key=1e-4..1e-3:5log] ... [num_seeds=N] [sweep_dir=PATH]
+jaxswarm-sweep search=NAME [trials=N] [storage=PATH|URL] [key=value ...] [num_seeds=N] [sweep_dir=PATH]
+jaxswarm-sweep resume=PATH
+
+The first form trains every combination of the values, each in a run folder of its own: what is only a number side by
+side in one program, the rest one program after another. Ends with a table, summary.csv and curves.png.
+
+The second form searches with Optuna: configs/search/NAME.yaml, or a file, says what may be chosen. Trials are trained
+over num_seeds seeds; the mean return during training is maximised. Machines that name the same storage (a journal file
+that they share, or a database such as postgresql://user@host/name) work on the same search, each in its own sweep_dir.
+
+Ctrl-C or SIGTERM ends after a checkpoint; resume=PATH goes on from there.
+
+examples
+  jaxswarm-sweep learner.learning_rate=1e-4,3e-4,1e-3 aggregator=mean,bayesian num_seeds=8
+  jaxswarm-sweep "learner.learning_rate=1e-4..1e-2:5 log" num_seeds=4 task=pursuit
+  jaxswarm-sweep search=thesis aggregator=bayesian trials=40 num_seeds=4 storage=shared/journal.log
+"""
+OPTIONS = ("sweep_dir", "resume", "search", "trials", "storage")
+PLAN = "sweep.json"  # what was asked for, in the folder of the sweep
+
+
+@program
+def main(arguments: Sequence[str]) -> int:
+    """Sweeps, searches, or continues; returns the exit code."""
+    if wants_help(arguments) or not arguments:
+        print(HELP)
+        return 0 if arguments else 2
+    options, words = split(arguments, OPTIONS)
+    if "resume" in options:
+        if words or len(options) > 1:
+            raise ConfigError("resume=PATH takes nothing else")
+        sweep_dir = Path(options["resume"])
+        options, words = _load(sweep_dir)
+    else:
+        sweep_dir = Path(options.pop("sweep_dir", "") or f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}")
+        if sweep_dir.exists() and any(sweep_dir.iterdir()):
+            raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; continue it with resume={sweep_dir}")
+    if "search" in options:
+        return _search(sweep_dir, options, words)
+    if options:
+        raise ConfigError(f"{next(iter(options))} has no meaning without search=NAME")
+    return _sweep(sweep_dir, words)
+
+
+def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
+    from jaxswarm import sweep  # noqa: PLC0415
+
+    trials = sweep.trials(sweep.expand(words), sweep_dir)
+    programs = sweep.programs(trials)
+    use_compile_cache()
+    use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
+    _save(sweep_dir, {}, words)
+    print(f"{_count(trials, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
+    rows = {}
+    for number, together in enumerate(programs):
+        num_seeds = together[0].settings.num_seeds
+        names = ", ".join(trial.run_dir.name for trial in together)
+        print(f"program {number + 1} of {len(programs)}: {names}; seeds of each: {num_seeds}", flush=True)
+        is_finished, of_each = sweep.train(together)
+        if not is_finished:
+            print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
+            return 0
+        rows |= {trial.run_dir: x for trial, x in zip(together, of_each, strict=True)}
+    table = sweep.summary(trials, [rows[trial.run_dir] for trial in trials])
+    sweep.write_summary(sweep_dir / "summary.csv", table)
+    for line in table:
+        spread = f"{line['median']:10.2f} [{line['q25']:.2f}, {line['q75']:.2f}]"
+        note = f", {line['diverged']} diverged" if line["diverged"] else ""
+        print(f"{spread}  {line['run']}, seeds: {line['seeds']}{note}")
+    return plot.main([str(sweep_dir), f"out={sweep_dir / 'curves.png'}"])
+
+
+def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> int:
+    from jaxswarm import search, sweep  # noqa: PLC0415
+
+    pairs = configs.parse(words)
+    config = configs.compose_pairs(pairs)
+    space = search.load_space(options["search"], config)
+    num_trials = whole("trials", options.get("trials", 20), 1)
+    use_compile_cache()
+    use_cores(config["num_seeds"])
+    _save(sweep_dir, options, words)
+    study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")), config["seed"])
+    search.requeue_killed(study, sweep_dir)
+    while search.num_begun(study) < num_trials:
+        asked = study.ask()
+        run_dir = Path(asked.user_attrs.get(search.RUN_DIR, sweep_dir.resolve() / f"trial-{asked.number:04}"))
+        asked.set_user_attr(search.RUN_DIR, str(run_dir))
+        of_trial = search.suggest(asked, space, pairs)
+        print(f"trial {asked.number}: {json.dumps(asked.params)}", flush=True)
+        is_finished, (rows,) = sweep.train([sweep.Trial(of_trial, configs.build(of_trial), run_dir)])
+        if not is_finished:
+            search.requeue(study, asked.number)
+            print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
+            return 0
+        search.tell(study, asked, search.value(rows))
+    done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
+    for trial in sorted(done, key=lambda trial: trial.value or 0.0, reverse=True)[:5]:
+        print(f"{trial.value:10.2f}  {trial.user_attrs[search.RUN_DIR]}  {json.dumps(trial.params)}")
+    return 0
+
+
+def _count(things: Sequence, name: str) -> str:
+    return f"{len(things)} {name}" + ("s" if len(things) != 1 else "")
+
+
+def _save(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> None:
+    from jaxswarm.checkpoint import replace_text  # noqa: PLC0415
+
+    sweep_dir.mkdir(parents=True, exist_ok=True)
+    replace_text(sweep_dir / PLAN, json.dumps({"options": options, "words": list(words)}, indent=2) + "\n")
+
+
+def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
+    try:
+        plan = json.loads((sweep_dir / PLAN).read_text())
+        return plan["options"], plan["words"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no {PLAN}") from error

@@ -1,0 +1,143 @@
+"""Search for good settings with Optuna, by any number of processes that share a storage.
+
+Each trial is a run folder, trained over several seeds side by side. Its value is the mean of all evaluation returns
+during training, over seeds: what the thesis maximised, which rewards good results and getting there soon.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxswarm import config as configs
+from jaxswarm.config import Config, ConfigError
+from jaxswarm.learners.on_policy import nearest_batch_sizes
+from jaxswarm.recording import RETURN
+from jaxswarm.reporting import Row
+
+if TYPE_CHECKING:
+    import optuna
+
+BATCH_SIZE = "learner.batch_size"
+REQUEUED = "requeued"  # a trial that was cut off, and will be continued as another one
+RUN_DIR = "run_dir"
+
+Space = dict[str, Any]  # what may be chosen for each key
+
+
+def load_space(name: str, config: Config) -> Space:
+    """The space of a file in `configs/search`, or at a path, for the aggregator of the config."""
+    shipped = {path.stem: path for path in (configs.config_dir() / configs.SEARCHES).glob("*.yaml")}
+    path = shipped.get(name, Path(name))
+    if not path.is_file():
+        raise ConfigError(f"search = {name} does not exist; accepted: {', '.join(sorted(shipped))}, or a YAML file")
+    content = configs.read(path)
+    if unknown := set(content) - {"parameters", "aggregator"}:
+        raise ConfigError(f"{path} has a key {unknown.pop()!r}; accepted: parameters, aggregator")
+    of_aggregator = content.get("aggregator", {}).get(config["aggregator"]["name"], {})
+    space = content.get("parameters", {}) | of_aggregator
+    for key, choice in space.items():
+        _check(key, choice)
+    return space
+
+
+def open_study(storage: str, seed: int, name: str = "jaxswarm") -> "optuna.Study":
+    """The study in a storage: a database's URL, or the path of a journal file that machines may share."""
+    try:
+        import optuna  # noqa: PLC0415
+        from optuna.storages.journal import JournalFileBackend  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError('search needs a package: pip install "jaxswarm[search]"') from error
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        where = storage if "://" in storage else optuna.storages.JournalStorage(JournalFileBackend(storage))
+        study = optuna.create_study(storage=where, study_name=name, direction="maximize", load_if_exists=True)
+    except Exception as error:
+        raise ConfigError(f"storage = {storage} cannot be opened: {' '.join(str(error).split())[:200]}") from error
+    # each process, and each session, draws other numbers
+    study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.get_trials(deepcopy=False)))
+    return study
+
+
+def num_begun(study: "optuna.Study") -> int:
+    """Trials that were begun, by any process, and were not cut off."""
+    trials = study.get_trials(deepcopy=False)
+    return sum(trial.state.name != "WAITING" and REQUEUED not in trial.user_attrs for trial in trials)
+
+
+def requeue(study: "optuna.Study", trial_number: int) -> None:
+    """Lets a trial that was cut off be continued by whoever comes next."""
+    trial = study.get_trials(deepcopy=False)[trial_number]
+    study.enqueue_trial(trial.params, user_attrs={RUN_DIR: trial.user_attrs[RUN_DIR]})
+    study._storage.set_trial_user_attr(trial._trial_id, REQUEUED, True)
+    study.tell(trial_number, state=_state("FAIL"))
+
+
+def requeue_killed(study: "optuna.Study", sweep_dir: Path) -> None:
+    """`requeue` for trials in this folder that a process left when it was killed; nobody else may work there."""
+    for trial in study.get_trials(deepcopy=False):
+        run_dir = trial.user_attrs.get(RUN_DIR)
+        if trial.state.name == "RUNNING" and run_dir and Path(run_dir).parent == sweep_dir.resolve():
+            requeue(study, trial.number)
+
+
+def suggest(trial: "optuna.Trial", space: Space, pairs: Sequence[tuple[str, Any]]) -> Config:
+    """The config of a trial; `pairs` are what the command line says, and win."""
+    given = {key for key, _ in pairs}
+    chosen = [(key, _suggest(trial, key, choice)) for key, choice in space.items() if key not in given]
+    config = configs.compose_pairs([*pairs, *[(key, value) for key, value in chosen if key != BATCH_SIZE]])
+    wanted = dict(chosen).get(BATCH_SIZE)
+    if wanted is None:
+        return config
+    experiment = configs.build(configs.override(config, [(BATCH_SIZE, None)]))
+    learner = experiment.learner.replace(batch_size=wanted)
+    sizes = nearest_batch_sizes(learner, experiment.agent_steps_per_update, experiment.task.num_agents)
+    return configs.override(config, [(BATCH_SIZE, sizes[0])])
+
+
+def value(rows: Sequence[Row]) -> float:
+    """Mean over all evaluations and seeds; NaN without any."""
+    returns = [row[RETURN] for row in rows]
+    return float(np.mean(returns)) if returns else math.nan
+
+
+def tell(study: "optuna.Study", trial: "optuna.Trial", found: float) -> None:
+    """Ends a trial; one without a finite value has failed."""
+    if math.isfinite(found):
+        study.tell(trial, found)
+    else:
+        study.tell(trial, state=_state("FAIL"))
+
+
+def _state(name: str) -> "optuna.trial.TrialState":
+    from optuna.trial import TrialState  # noqa: PLC0415
+
+    return TrialState[name]
+
+
+def _suggest(trial: "optuna.Trial", key: str, choice: Any) -> Any:
+    if isinstance(choice, list):
+        return trial.suggest_categorical(key, choice)
+    if "layers" in choice:
+        least, most = choice["layers"]
+        count = trial.suggest_int(f"{key}.layers", least, most)
+        widths = [_suggest(trial, f"{key}.{i}", {k: choice[k] for k in ("low", "high")}) for i in range(count)]
+        return [*widths, _suggest(trial, f"{key}.last", choice["last"])] if "last" in choice else widths
+    low, high = choice["low"], choice["high"]
+    options = {name: choice[name] for name in ("log", "step") if name in choice}
+    is_whole = isinstance(low, int) and isinstance(high, int)
+    return (trial.suggest_int if is_whole else trial.suggest_float)(key, low, high, **options)
+
+
+def _check(key: str, choice: Any) -> None:
+    """Raises a `ConfigError` for what is not a choice."""
+    names = {"low", "high", "log", "step", "layers", "last"}
+    if isinstance(choice, list) and choice:
+        return
+    is_range = isinstance(choice, Mapping) and {"low", "high"} <= choice.keys() <= names
+    if not isinstance(choice, Mapping) or not is_range or choice["low"] > choice["high"]:
+        accepted = "a list, or low, high and if wanted log, step, layers, last"
+        raise ConfigError(f"{key}: {choice} is not possible in a search space; accepted: {accepted}")

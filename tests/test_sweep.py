@@ -1,0 +1,152 @@
+"""Sweeps and searches of tiny experiments, through the program that users call."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import TINY
+
+from jaxswarm import config, fit, reporting, search, sweep
+from jaxswarm.cli import evaluate
+from jaxswarm.cli import sweep as program
+from jaxswarm.config import ConfigError
+
+WORDS = [*TINY, "num_updates=4", "num_seeds=2"]
+SWEPT = [*WORDS, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu"]
+
+
+@pytest.mark.parametrize(
+    ("word", "values"),
+    [
+        ("learner.learning_rate=1e-4..1e-2:3 log", [1e-4, 1e-3, 1e-2]),
+        ("learner.learning_rate=0.1..0.2:3", [0.1, 0.15, 0.2]),
+        ("task.num_agents=5..20:4", [5, 10, 15, 20]),
+        ("learner.learning_rate=1e-4,2e-4", [1e-4, 2e-4]),
+    ],
+)
+def test_ranges_are_lists(word, values):
+    key = word.partition("=")[0].split(".")
+    found = [wanted[key[0]][key[1]] for wanted in sweep.expand([word])]
+    np.testing.assert_allclose(found, values, rtol=1e-6)
+    assert {type(x) for x in found} == {type(x) for x in values}
+
+
+@pytest.mark.parametrize("word", ["learner.learning_rate=0..1:3log", "learner.learning_rate=a..b:3", "seed=1..5:1"])
+def test_impossible_ranges_are_errors(word):
+    with pytest.raises(ConfigError, match=r"is not possible; accepted: .*low\.\.high:count"):
+        sweep.expand([word])
+
+
+def test_what_fixes_a_shape_has_a_program_of_its_own(tmp_path):
+    trials = sweep.trials(sweep.expand(SWEPT), tmp_path)
+    assert len(trials) == 6
+    assert [len(together) for together in sweep.programs(trials)] == [3, 3]
+    names = [trial.run_dir.name for trial in trials]
+    assert names[0] == "0-learning_rate_0.0001-activation_tanh"
+    assert len(set(names)) == 6
+
+
+def test_equal_runs_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="the same"):
+        sweep.trials(sweep.expand([*WORDS, "seed=1,2"]), tmp_path)
+
+
+@pytest.mark.slow
+def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, capsys):
+    sweep_dir, begun = tmp_path / "sweep", []
+    real = sweep.fit_runs
+
+    def stops_in_the_second_program(runs, num_updates, **options):
+        begun.append(runs)
+        return real(runs, 2 if len(begun) == 2 else num_updates, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep, "fit_runs", stops_in_the_second_program)
+        assert program.main([*SWEPT, f"sweep_dir={sweep_dir}"]) == 0
+    assert "stopped; continue with" in capsys.readouterr().out
+    assert not (sweep_dir / "summary.csv").exists()
+    assert program.main([f"resume={sweep_dir}"]) == 0
+    with open(sweep_dir / "summary.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == 6
+    assert {line["seeds"] for line in table} == {"2"}
+    medians = [float(line["median"]) for line in table]
+    assert medians == sorted(medians, reverse=True)
+    assert (sweep_dir / "curves.png").stat().st_size > 10_000
+    folders = sorted(path for path in sweep_dir.iterdir() if path.is_dir())
+    for folder in folders:
+        rows = reporting.read_rows(folder / "metrics.csv")
+        assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 4) for s in (5, 6)]
+    alone = config.load(folders[3] / "config.yaml")
+    _, expected = fit.fit(config.build(alone), 4, seed=6, progress=False)
+    found = [row["eval/return"] for row in reporting.read_rows(folders[3] / "metrics.csv") if row["seed"] == 6]
+    np.testing.assert_allclose(found, [row["eval/return"] for row in expected], rtol=1e-5)
+    assert evaluate.main([str(folders[0]), "episodes=2"]) == 0
+    assert "of each of 2 seeds" in capsys.readouterr().out
+
+
+SPACE = """
+parameters:
+  learner.learning_rate: {low: 1e-4, high: 1e-2, log: true}
+  learner.batch_size: {low: 5, high: 30}
+"""
+
+
+def test_the_space_of_the_thesis_gives_configs_for_each_aggregator():
+    optuna = pytest.importorskip("optuna")
+    for name in ("mean", "bayesian", "attentive"):
+        pairs = config.parse([f"aggregator={name}", "task=pursuit"])
+        space = search.load_space("thesis", config.compose_pairs(pairs))
+        for seed in range(3):
+            study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed))
+            experiment = config.build(search.suggest(study.ask(), space, pairs))
+            assert 1 <= len(experiment.network.encoder) <= 3
+            assert 400 < experiment.batch_size < 12_000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("parameters: {learner.learning_rate: {low: 2, high: 1}}", "not possible in a search space"),
+        ("parameters: {learner.learning_rate: {lowest: 1}}", "not possible in a search space"),
+        ("params: {}", "has a key 'params'"),
+    ],
+)
+def test_impossible_spaces_are_errors(tmp_path, text, message):
+    (tmp_path / "space.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        search.load_space(str(tmp_path / "space.yaml"), {"aggregator": {"name": "mean"}})
+    with pytest.raises(ConfigError, match="accepted: thesis"):
+        search.load_space("unknown", {"aggregator": {"name": "mean"}})
+
+
+@pytest.mark.slow
+def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("optuna")
+    (tmp_path / "space.yaml").write_text(SPACE)
+    storage = tmp_path / "journal.log"
+    words = [*WORDS, f"search={tmp_path / 'space.yaml'}", "trials=3", f"storage={storage}"]
+    words = [word for word in words if "batch_size" not in word]
+    real = sweep.fit_runs
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep, "fit_runs", lambda runs, num_updates, **options: real(runs, 2, **options))
+        assert program.main([*words, f"sweep_dir={tmp_path / 'one'}"]) == 0
+    assert "stopped; continue with" in capsys.readouterr().out
+    assert program.main([*words, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over
+    study = search.open_study(str(storage), 0)
+    complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
+    assert len(complete) == 3
+    first = next(trial for trial in complete if Path(trial.user_attrs["run_dir"]).parent.name == "one")
+    rows = reporting.read_rows(Path(first.user_attrs["run_dir"]) / "metrics.csv")
+    assert first.value == pytest.approx(np.mean([row["eval/return"] for row in rows]), rel=1e-6)
+    assert {row["update"] for row in rows} == {0, 3, 4}
+    assert json.loads((tmp_path / "two" / "sweep.json").read_text())["options"]["trials"] == "3"
+
+
+def test_wrong_words_are_errors(tmp_path, capsys):
+    assert program.main(["trials=3", "learner.learning_rate=1,2"]) == 2
+    assert "without search=NAME" in capsys.readouterr().err
+    assert program.main([f"resume={tmp_path}"]) == 2
+    assert "not the folder of a sweep" in capsys.readouterr().err
