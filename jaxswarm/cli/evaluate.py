@@ -2,14 +2,14 @@
 
 import functools
 import json
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.words import load, only, program, resume_command, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.policies import load_policy, require_fit, which_checkpoint
+from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
@@ -34,9 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     options, words = split([word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed"))
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
-    which = options.get("checkpoint", "best")
-    if which not in ("best", "last"):
-        raise ConfigError(f"checkpoint = {which!r} is not possible; accepted: best, last")
+    which = which_checkpoint(options)
     config = load(Path(paths[0]))
     episodes = whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
     seed = whole("seed", options.get("seed", 0), 0)
@@ -51,40 +49,30 @@ def _evaluate(
     run_dir: Path, config: Config, changes: Sequence[Sequence[tuple[str, Any]]], asked: dict[str, Any]
 ) -> dict[str, Any] | None:
     """Plays the episodes of every changed task; `None` after saying that no checkpoint can be restored."""
-    experiment = configs.build(config)
     tasks = [configs.override(config, pairs)["task"] for pairs in changes]
     built = [configs.build_part("task", {"task": task}) for task in tasks]
     use_compile_cache()
+    policy = load_policy(run_dir, config, asked["which"])
+    if policy is None:
+        return None
+    for task in built:
+        require_fit(policy, task)
     import jax  # noqa: PLC0415
 
     from jaxswarm import rollout  # noqa: PLC0415
-    from jaxswarm.checkpoint import CheckpointError, restore  # noqa: PLC0415
-    from jaxswarm.fit import abstract_state  # noqa: PLC0415
 
-    warn = functools.partial(print, file=sys.stderr)
-    try:
-        restored = restore(run_dir / "checkpoints", abstract_state(experiment), asked["which"], warn)
-    except CheckpointError as error:
-        warn(f"error: {error}")
-        return None
-    if restored is None:
-        raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: {resume_command(run_dir)}")
-    params, key = restored.train_state.learner.params, jax.random.key(asked["seed"])
-    for task in built:
-        needed = jax.eval_shape(lambda task=task: experiment.network.init(key, task.observe(task.reset(key))))
-        if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape, params):
-            raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
+    key = jax.random.key(asked["seed"])
 
     @jax.jit
     def play(params: Any, task: Any) -> dict[str, Any]:
-        policy: Any = functools.partial(experiment.network.apply, params, method="policy")
-        return rollout.evaluate(key, task, policy, asked["episodes"])
+        act: Any = functools.partial(policy.network.apply, params, method="policy")
+        return rollout.evaluate(key, task, act, asked["episodes"])
 
     results = [
-        {"changed": dict(pairs), "task": task, "metrics": {name: float(x) for name, x in play(params, b).items()}}
+        {"changed": dict(pairs), "task": task, "metrics": {name: float(x) for name, x in play(policy.params, b).items()}}
         for pairs, task, b in zip(changes, tasks, built, strict=True)
     ]
-    found = {"update": restored.update, "score_in_training": restored.score, "device": jax.devices()[0].device_kind}
+    found = {"update": policy.update, "score_in_training": policy.score, "device": jax.devices()[0].device_kind}
     return asked | found | {"results": results}
 
 
