@@ -325,7 +325,7 @@ class Concat(nn.Module):
 
     def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
         """Equal for those that there is room for, 0 for the others."""
-        is_taken = (self._order(view)[..., None] == jnp.arange(view.mask.shape[1])).any(1)
+        is_taken = jax.nn.one_hot(self._order(view), view.mask.shape[1], dtype=bool).any(1)
         return _shares((is_taken & view.mask)[..., None], view.mask)
 
     def _order(self, view: DenseView) -> Int[Array, "receivers nearest"]:

@@ -85,9 +85,7 @@ class Tower(nn.Module):
         return self._compute(own, groups, "weights")
 
     @nn.compact
-    def _compute(
-        self, own: Array, groups: dict[str, Entities], wanted: Literal["latent", "weights"] = "latent"
-    ) -> Any:
+    def _compute(self, own: Array, groups: dict[str, Entities], wanted: Literal["latent", "weights"] = "latent") -> Any:
         names = sorted(groups)
         if self.latent_space == "shared" and self.aggregator.num_encoders == 0 and len(names) > 1:
             raise ValueError(

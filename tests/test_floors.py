@@ -11,7 +11,7 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
-    {"types"},
+    {"types", "scene"},
     {"geometry", "contacts", "sets", "distributions"},
     {"dynamics", "neighbors", "shapes", "aggregators"},
     {"rigid2d", "tasks.swarm", "tasks.evasion", "networks"},
@@ -25,9 +25,13 @@ FLOORS = [
     {"training"},
     {"config", "checkpoint"},
     {"reporting"},
+    {"render.film"},
+    {"render.page", "render.pictures"},
+    {"render"},
     {"fit"},
     {"cli.words"},
-    {"cli.train", "cli.evaluate"},
+    {"cli.policies"},
+    {"cli.train", "cli.evaluate", "cli.render"},
     {"cli"},
 ]
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

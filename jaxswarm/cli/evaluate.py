@@ -68,9 +68,10 @@ def _evaluate(
         act: Any = functools.partial(policy.network.apply, params, method="policy")
         return rollout.evaluate(key, task, act, asked["episodes"])
 
+    played = [{name: float(x) for name, x in play(policy.params, task).items()} for task in built]
     results = [
-        {"changed": dict(pairs), "task": task, "metrics": {name: float(x) for name, x in play(policy.params, b).items()}}
-        for pairs, task, b in zip(changes, tasks, built, strict=True)
+        {"changed": dict(pairs), "task": task, "metrics": metrics}
+        for pairs, task, metrics in zip(changes, tasks, played, strict=True)
     ]
     found = {"update": policy.update, "score_in_training": policy.score, "device": jax.devices()[0].device_kind}
     return asked | found | {"results": results}

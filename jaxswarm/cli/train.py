@@ -14,7 +14,7 @@ HELP = """\
 jaxswarm-train [group=choice | key=value] ... [run_dir=PATH]
 jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
 
-Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, checkpoints.
+Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, replay.html, checkpoints.
 Ctrl-C or SIGTERM ends it after a checkpoint; resume=PATH continues it exactly where its last checkpoint stands.
 
 examples
@@ -87,6 +87,9 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
     if update < num_updates:
         print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
         return 0
+    from jaxswarm import render  # noqa: PLC0415
+
+    render.write_replay(run_dir, experiment, train_state.learner.params, update=update)
     if rows:
         print(f"done: {update} updates, return {rows[-1]['eval/return']:.2f} (untrained {rows[0]['eval/return']:.2f})")
     print(f"{_files(run_dir)}\nnext: {command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
@@ -129,6 +132,7 @@ def _summary(config: Config, experiment: Any, num_updates: int, run_dir: Path) -
 def _files(run_dir: Path) -> str:
     about = {
         "curve.png": "learning curve",
+        "replay.html": "an episode of the last policy: open it in a browser",
         "metrics.csv": "a row per evaluation",
         "checkpoints": "the latest and the best state",
         "config.yaml": "what was asked for",

@@ -63,7 +63,9 @@ class Film:
         return int(np.clip(side / 8 / np.median(moving), 10, 60)) if moving.size else 10
 
 
-def record(task: Any, network: Any, params: Any, *, seed: int = 0, title: str = "", max_shares: int = MAX_SHARES) -> Film:
+def record(
+    task: Any, network: Any, params: Any, *, seed: int = 0, title: str = "", max_shares: int = MAX_SHARES
+) -> Film:
     """Plays one episode.
 
     Shares take a number for each agent and body. Of swarms where that exceeds `max_shares` numbers in all frames they

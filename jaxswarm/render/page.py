@@ -63,7 +63,10 @@ def quantise_shares(shares: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
 def _arrays(film: Film) -> dict[str, tuple[str, np.ndarray]]:
     arrays: dict[str, tuple[str, np.ndarray]] = {"score": ("f32", film.score.astype(np.float32))}
     for role, bodies in film.scenes.kinds.items():
-        arrays[f"{role}.position"] = ("u16", quantise_positions(bodies.position, bodies.is_present, film.low, film.high))
+        arrays[f"{role}.position"] = (
+            "u16",
+            quantise_positions(bodies.position, bodies.is_present, film.low, film.high),
+        )
         if bodies.heading is not None:
             arrays[f"{role}.heading"] = ("u8", quantise_headings(bodies.heading))
     if film.shares is not None:

@@ -126,7 +126,7 @@ def _draw_trails(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
     age = np.broadcast_to((frame - np.arange(start, frame))[:, None], is_drawn.shape)
     rgb = np.array([to_rgb(colour) for colour in _colours(role, bodies, frame)])
     rgb = np.broadcast_to(rgb, (*is_drawn.shape, 3))
-    alpha = 0.08 + 0.5 * (1 - age / (film.trail + 1)) ** 2
+    alpha = 0.1 + 0.7 * (1 - age / (film.trail + 1)) ** 2
     rgba = np.concatenate([rgb, alpha[..., None]], -1)
     axes.add_collection(LineCollection(list(lines[is_drawn]), colors=rgba[is_drawn], linewidths=1.0, zorder=2))
 
@@ -143,10 +143,10 @@ def _draw_bodies(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
     place = bodies.position[frame][is_present]
     heading = np.zeros(len(place)) if bodies.heading is None else bodies.heading[frame][is_present]
     colours = np.array(_colours(role, bodies, frame))[is_present]
-    shapes = _placed(outline, place, heading, size)
+    shapes = list(_placed(outline, place, heading, size))
     axes.add_collection(PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.5, zorder=3))
     if role == "agents" and not is_pointed:
-        noses = _placed(NOSE, place, heading, size)
+        noses = list(_placed(NOSE, place, heading, size))
         axes.add_collection(PolyCollection(noses, facecolors="white", zorder=3))
     if role == "boxes" and bodies.group is not None and bodies.group[frame].any():
         dots = _dots(bodies.group[frame][is_present], place, size)
@@ -154,7 +154,10 @@ def _draw_bodies(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
 
 
 def _placed(
-    outline: Float[np.ndarray, "points 2"], place: Shaped[np.ndarray, "n 2"], heading: Shaped[np.ndarray, " n"], size: float
+    outline: Float[np.ndarray, "points 2"],
+    place: Shaped[np.ndarray, "n 2"],
+    heading: Shaped[np.ndarray, " n"],
+    size: float,
 ) -> Shaped[np.ndarray, "n points 2"]:
     """An outline at many places."""
     cos, sin = np.cos(heading), np.sin(heading)
