@@ -18,7 +18,7 @@ STRIP_WIDTH, MOVING_WIDTH = 2.2, 3.6  # inches, of one picture
 STRIP_RESOLUTION, MOVING_RESOLUTION = 200, 100  # dots per inch
 GIF_RATE, MP4_RATE = 20, 30  # pictures per second
 GIF_COLOURS = 64
-POINT = 0.024  # radius of a point over the side of the world
+POINT = 0.019  # radius of a point over the side of the world
 JUMP = 0.12  # over the side: who moves further in one step crossed a seam or was put there; no trail leads there
 KITE = np.array([[1.5, 0.0], [-1.0, 0.9], [-0.45, 0.0], [-1.0, -0.9]])  # over the radius, heading along x
 SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
@@ -107,7 +107,7 @@ def draw(axes: Any, film: Film, frame: int) -> None:
         _draw_trails(axes, film, role, bodies, frame)
     past = [place for when, place in film.catches if when <= frame]
     if past:
-        axes.scatter(*np.transpose(past), s=26, marker="x", color=LIGHT["caught"], linewidth=1.6, zorder=2.5)
+        axes.scatter(*np.transpose(past), s=26, marker="x", color=LIGHT["caught"], linewidth=1.8, zorder=4)
     for role, bodies in reversed(film.scenes.kinds.items()):
         _draw_bodies(axes, film, role, bodies, frame)
 
