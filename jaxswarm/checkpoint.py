@@ -7,6 +7,7 @@ it is complete, so that damage is noticed before anything is read from it.
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -104,13 +105,14 @@ def restore(
     template: Any,
     which: Literal["last", "best"] = "last",
     on_damage: Callable[[str], None] = print,
+    up_to: int | float = math.inf,
 ) -> Restored | None:
-    """The last or the best checkpoint that is whole; `None` where none was ever written.
+    """The last or the best checkpoint that is whole, of an update `up_to` some; `None` where none was ever written.
 
     `template` is the abstract state, `jax.eval_shape(init, ...)`. Says of each damaged checkpoint that it was skipped;
     raises `CheckpointError` when there is no other.
     """
-    updates = sorted(_updates(directory), reverse=True)
+    updates = sorted((update for update in _updates(directory) if update <= up_to), reverse=True)
     if which == "best":
         scores = {update: _read_score(directory, update) for update in updates}
         updates.sort(key=lambda update: (scores[update] is not None, scores[update] or 0.0), reverse=True)

@@ -14,7 +14,7 @@ import types
 import typing
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from jaxswarm.training import Experiment
@@ -32,24 +32,31 @@ class ConfigError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a config says beyond the experiment. Of `num_updates` and `total_agent_steps`, one is given."""
+    """What a config says beyond the experiment; of `num_updates` and `total_agent_steps`, one is given."""
 
     seed: int = 0
+    num_seeds: int = 1
     num_updates: int | None = None
     total_agent_steps: int | None = None
     checkpoint_seconds: float = 30.0
     keep_checkpoints: int = 3
+    loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
 
     def __post_init__(self) -> None:
         if (self.num_updates is None) == (self.total_agent_steps is None):
             raise ConfigError("give one of num_updates and total_agent_steps")
-        least = {"seed": 0, "checkpoint_seconds": 0, "num_updates": 1, "total_agent_steps": 1, "keep_checkpoints": 1}
-        for name, bound in least.items():
-            value = getattr(self, name)
-            if value is not None and value < bound:
+        for field in dataclasses.fields(self):
+            name, value = field.name, getattr(self, field.name)
+            bound = 0 if name in ("seed", "checkpoint_seconds") else 1
+            if isinstance(value, int | float) and value < bound:
                 raise ConfigError(f"{name} = {value!r} is not possible; accepted: numbers from {bound}")
-        if self.seed >= 2**32:
+        if self.seed + self.num_seeds > 2**32:
             raise ConfigError(f"seed = {self.seed} is not possible; accepted: numbers below 2**32")
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Those that are trained side by side."""
+        return tuple(range(self.seed, self.seed + self.num_seeds))
 
     def length(self, agent_steps_per_update: int) -> int:
         """Number of updates; a last update that is only partly wanted is done in full."""
@@ -94,7 +101,12 @@ def compose(words: Sequence[str] = ()) -> Config:
 
 
 def load(path: Path) -> Config:
-    """The config of a run, as `save` wrote it."""
+    """The config of a run, as `dump` wrote it."""
+    return validate(read(path))
+
+
+def read(path: Path) -> Config:
+    """What a file says, be it the config of a run of another version."""
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     try:
@@ -103,7 +115,16 @@ def load(path: Path) -> Config:
         raise ConfigError(f"cannot read {path}: {error}") from error
     if not isinstance(config, dict):
         raise ConfigError(f"cannot read {path}: no keys in it")
-    return validate(typing.cast(Config, config))
+    return typing.cast(Config, config)
+
+
+def preset(group: str, choice: str) -> dict[str, Any]:
+    """The values of a choice, those of its defaults included."""
+    values = read(config_dir() / group / f"{choice}.yaml")
+    merged = {}
+    for default in values.pop("defaults", []):
+        merged |= preset(group, default)
+    return merged | values
 
 
 def dump(config: Config) -> str:
@@ -217,7 +238,7 @@ def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
 
 def run_settings(config: Config) -> Run:
     """What the config says beyond the experiment."""
-    return Run(**{field.name: config[field.name] for field in dataclasses.fields(Run)})
+    return Run(**_tuples({field.name: config[field.name] for field in dataclasses.fields(Run)}))
 
 
 def _registries() -> dict[str, dict[str, Any]]:
@@ -333,7 +354,9 @@ def _describe(annotation: Any) -> str:
         if typing.get_origin(accepted) is typing.Literal:
             described += [str(x) for x in typing.get_args(accepted)]
         elif typing.get_origin(accepted) is tuple:
-            described.append("a list of integers from 1, like [120,60]")
+            element = typing.get_args(accepted)[0]
+            named = f"a list of {_describe(element)}"
+            described.append("a list of integers from 1, like [120,60]" if element is int else named)
         elif accepted is types.NoneType:
             described.append("null")
         elif accepted in words:

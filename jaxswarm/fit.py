@@ -2,66 +2,48 @@
 
 While the host works on one chunk's results the device computes the next, so that files cost training no time. The
 arithmetic does not depend on where chunks end: states and metrics are those of `train`, bit by bit, however often a
-run was stopped and resumed.
+run was stopped and resumed. Several seeds, and several runs, are trained side by side; see `ensemble`.
 """
 
 import contextlib
-import dataclasses
 import math
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxswarm import reporting
-from jaxswarm.checkpoint import Checkpoints, Restored, restore, set_aside_after
+from jaxswarm import ensemble, loggers, reporting
+from jaxswarm.checkpoint import Restored, restore, set_aside_after
+from jaxswarm.ensemble import Batch
+from jaxswarm.recording import Recorder, Run, draw_curve
 from jaxswarm.reporting import Row
-from jaxswarm.training import Experiment, TrainState, evaluate, init, train_chunk
+from jaxswarm.training import Experiment, TrainState, init
 from jaxswarm.types import Metrics
 
-RETURN = "eval/return"
 SECONDS_PER_CHUNK = 1.0  # between signs of life, where an update is quicker than that
 MAX_CHUNK = 64  # updates
 
-_run_chunk = jax.jit(train_chunk, static_argnames="size", donate_argnames="train_state")
-
-
-@jax.jit
-def _copy(train_state: TrainState) -> TrainState:
-    """The same state in buffers of its own: the next chunk overwrites those it is given."""
-    return jax.tree.map(jnp.copy, train_state)
-
 
 class DivergedError(RuntimeError):
-    """A loss or an evaluation is not a finite number."""
+    """A parameter, a loss or an evaluation is not a finite number, in every run."""
 
 
-@dataclasses.dataclass
-class _Chunk:
+class _Chunk(NamedTuple):
     """Updates that the device has been asked for."""
 
     start: int  # updates done before
     length: int
-    metrics: Metrics  # on the device
-    state_before: TrainState | None  # if it may have to be saved
-
-
-@dataclasses.dataclass
-class _Candidate:
-    """A state that may be saved, and what else continues the run from there."""
-
-    update: int
-    train_state: TrainState
-    record: dict[str, Any]
-    score: float | None
+    metrics: Metrics  # [runs, updates], on the device
+    states_before: TrainState | None  # if they may have to be saved
+    is_saved: bool
 
 
 def fit(
@@ -69,132 +51,159 @@ def fit(
     num_updates: int,
     *,
     seed: int = 0,
+    num_seeds: int | None = None,
     run_dir: str | Path | None = None,
     resume: bool = False,
     progress: bool = True,
     checkpoint_seconds: float = 30.0,
     keep_checkpoints: int = 3,
+    log_to: tuple[str, ...] = (),
+    config: Mapping[str, Any] | None = None,
 ) -> tuple[TrainState, list[Row]]:
-    """Trains from a seed until `num_updates` updates are done, or until Ctrl-C or SIGTERM, after the current chunk.
+    """Trains until `num_updates` updates are done, or until Ctrl-C or SIGTERM, after the current chunk.
 
     Returns the state and a row per evaluation: `update` is the number of updates that the evaluated policy has behind
     it, `agent_steps` what they took, `eval/...` its evaluation, other metrics are means over the updates since the
-    row before. With `run_dir` the folder gets `manifest.json`, `metrics.csv`, `checkpoints/` (the latest
-    `keep_checkpoints` and the best, at most every `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on
-    from its last checkpoint. Raises `DivergedError` when numbers stop being finite, `checkpoint.CheckpointError` when
-    there are checkpoints but none can be restored, and `FileExistsError` for a folder with another run in it.
+    row before. With `num_seeds` the seeds from `seed` on are trained side by side: the state has a leading axis, and
+    there is a row for each. A seed whose numbers stop being finite stays as it was before.
+
+    `log_to` are names in `loggers.LOGGERS`, to which `config` is shown.
+
+    With `run_dir` the folder gets `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and
+    the best, at most every `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last
+    checkpoint. Raises `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints
+    but none can be restored, and `FileExistsError` for a folder with another run in it.
     """
-    run_dir = None if run_dir is None else Path(run_dir)
-    if run_dir and not resume and (run_dir / "metrics.csv").exists():
-        raise FileExistsError(f"{run_dir} holds a run already; resume it or choose another folder")
-    restored = _restore(experiment, seed, run_dir) if resume and run_dir else None
-    if restored and restored.update >= num_updates:
+    seeds = tuple(range(seed, seed + (num_seeds or 1)))
+    run = Run(experiment, seeds, None if run_dir is None else Path(run_dir), log_to, config)
+    states, (rows,) = fit_runs(
+        [run],
+        num_updates,
+        resume=resume,
+        progress=progress,
+        checkpoint_seconds=checkpoint_seconds,
+        keep_checkpoints=keep_checkpoints,
+    )
+    return (jax.tree.map(lambda x: x[0], states) if num_seeds is None else states), rows
+
+
+def fit_runs(
+    runs: Sequence[Run],
+    num_updates: int,
+    *,
+    resume: bool = False,
+    progress: bool = True,
+    checkpoint_seconds: float = 30.0,
+    keep_checkpoints: int = 3,
+) -> tuple[TrainState, list[list[Row]]]:
+    """`fit` for several runs in one program; they differ in numbers, seeds and folders.
+
+    Returns states with a leading axis, the seeds of the first run first, and the rows of each run. Resumes all from
+    the last update of which each has a checkpoint.
+    """
+    for run in runs:
+        if run.run_dir and not resume and (run.run_dir / "metrics.csv").exists():
+            raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
+        for name in run.loggers:
+            loggers.load(name)
+    restored = _restore(runs) if resume else None
+    if restored and restored[0].update >= num_updates:
         if progress:
-            print(f"{run_dir} is finished: {restored.update} of {num_updates} updates are done")
-        return restored.train_state, _finished_rows(run_dir, experiment)
-    start = restored.update if restored else 0
+            print(f"{runs[0].run_dir} is finished: {restored[0].update} of {num_updates} updates are done")
+        return _joined(restored), [_finished_rows(run) for run in runs]
+    batch = ensemble.make_batch([run.experiment for run in runs], len(runs[0].seeds))
+    is_first = jax.process_index() == 0  # of several processes, only the first one writes
+    runs = runs if is_first else [Run(run.experiment, run.seeds) for run in runs]
+    start = restored[0].update if restored else 0
+    agent_steps = runs[0].experiment.agent_steps_per_update * batch.num_runs
     with (
-        reporting.Progress(start, num_updates, experiment.agent_steps_per_update, progress) as shown,
+        reporting.Progress(start, num_updates, agent_steps, progress and is_first) as shown,
         _stop_requests() as stop,
     ):
-        recorder = _Recorder(
-            experiment,
-            seed=seed,
-            run_dir=run_dir,
-            restored=restored,
-            progress=shown,
-            checkpoint_seconds=checkpoint_seconds,
-            keep_checkpoints=keep_checkpoints,
-        )
+        recorders = [Recorder(run, restored[i] if restored else None, keep_checkpoints) for i, run in enumerate(runs)]
+        wall_seconds = restored[0].record["wall_seconds"] if restored else 0.0
+        desk = _Desk(batch, recorders, shown, start, wall_seconds, checkpoint_seconds)
         try:
-            train_state = restored.train_state if restored else init(experiment, jax.random.key(seed))
-            train_state = _train(
-                experiment, train_state, update=start, num_updates=num_updates, stop=stop, recorder=recorder
-            )
+            if restored:
+                states = ensemble.place(batch, _joined(restored))
+            else:
+                states = ensemble.init_batch(batch, [seed for run in runs for seed in run.seeds])
+            states = _train(states, num_updates, desk, stop)
         finally:
-            recorder.close()
-    return train_state, recorder.rows
+            for recorder in recorders:
+                recorder.close()
+    return states, [recorder.rows for recorder in recorders]
 
 
-def _train(
-    experiment: Experiment,
-    train_state: TrainState,
-    *,
-    update: int,
-    num_updates: int,
-    stop: threading.Event,
-    recorder: "_Recorder",
-) -> TrainState:
+def _train(states: TrainState, num_updates: int, desk: "_Desk", stop: threading.Event) -> TrainState:
     """Updates until the last one or a stop; the device always has the next chunk before the host turns to the last."""
-    in_flight: _Chunk | None = None
-    size = min(experiment.eval_every, MAX_CHUNK)
-    while update < num_updates and not stop.is_set():
-        to_evaluation = experiment.eval_every - update % experiment.eval_every
-        length = min(to_evaluation, num_updates - update, size, recorder.chunk_length())
-        is_wanted = update % experiment.eval_every == 0 or recorder.is_checkpoint_due()
-        before = _copy(train_state) if is_wanted and recorder.run_dir else None
-        train_state, metrics = _run_chunk(experiment, train_state, jnp.int32(length), size=size)
+    update, in_flight = desk.start, None
+    eval_every = desk.recorders[0].run.experiment.eval_every
+    size = min(eval_every, MAX_CHUNK)
+    program = ensemble.compile_batch(desk.batch, states, size, desk.progress.warn)
+    while update < num_updates:
+        length = min(eval_every - update % eval_every, num_updates - update, size, desk.chunk_length())
+        length, is_due, is_stopped = _agreed(length, desk.is_checkpoint_due(), stop.is_set())
+        if is_stopped:
+            break
+        is_wanted = desk.writes and (update % eval_every == 0 or is_due)
+        before = _copy(states) if is_wanted else None
+        states, metrics = program(desk.batch.experiments, states, jnp.int32(length))
         if in_flight:
-            recorder.record(in_flight)
+            desk.record(in_flight)
         else:
-            recorder.open(num_updates)
-        in_flight = _Chunk(update, length, metrics, before)
+            desk.open(num_updates)
+        in_flight = _Chunk(update, length, metrics, before, bool(is_due))
         update += length
     if in_flight:
-        recorder.record(in_flight)
-    recorder.finish(update, train_state, is_complete=update == num_updates)
-    return train_state
+        desk.record(in_flight)
+    desk.finish(update, states, is_complete=update == num_updates)
+    return states
 
 
-class _Recorder:
-    """Turns the chunks' metrics into rows, files and checkpoints, in order."""
+@jax.jit
+def _copy(states: TrainState) -> TrainState:
+    """The same states in buffers of their own: the next chunk overwrites those it is given."""
+    return jax.tree.map(jnp.copy, states)
+
+
+def _agreed(*values: int) -> list[int]:
+    """What the first process says; the same everywhere, so that all do the same."""
+    if jax.process_count() == 1:
+        return list(values)
+    from jax.experimental import multihost_utils  # noqa: PLC0415
+
+    return [int(x) for x in multihost_utils.broadcast_one_to_all(np.array(values))]
+
+
+class _Desk:
+    """Hands results of all runs to the recorder of each, and measures time."""
 
     def __init__(
         self,
-        experiment: Experiment,
-        *,
-        seed: int,
-        run_dir: Path | None,
-        restored: Restored | None,
+        batch: Batch,
+        recorders: Sequence[Recorder],
         progress: reporting.Progress,
+        start: int,
+        wall_seconds: float,
         checkpoint_seconds: float,
-        keep_checkpoints: int,
     ):
-        record = restored.record if restored else {"wall_seconds": 0.0, "since_evaluation": {}}
-        self.run_dir = run_dir
-        self.rows: list[Row] = []
-        self._experiment = experiment
-        self._seed = seed
-        self._progress = progress
+        self.batch = batch
+        self.recorders = recorders
+        self.progress = progress
+        self.start = start
+        self.writes = any(_agreed(*[recorder.run.run_dir is not None for recorder in recorders]))
         self._checkpoint_seconds = checkpoint_seconds
-        self._keep_checkpoints = keep_checkpoints
-        self._start = restored.update if restored else 0
-        self._since_evaluation: dict[str, list[float]] = record["since_evaluation"]
-        self._started = time.monotonic() - record["wall_seconds"]
-        self._wall_seconds = record["wall_seconds"]  # when the last recorded chunk was done
+        self._started = time.monotonic() - wall_seconds
+        self._wall_seconds = wall_seconds  # when the last recorded chunk was done
         self._seconds_per_update: float | None = None
         self._last_save = time.monotonic()
-        self._checkpoints: Checkpoints | None = None
-        self._best: _Candidate | None = None  # better than all on disk, and not yet there
+        self._num_reported = 0
 
     def open(self, num_updates: int) -> None:
-        """Prepares the run folder; called once the device is at work."""
-        if self.run_dir:
-            self.run_dir.mkdir(parents=True, exist_ok=True)
-            manifest = reporting.manifest(self._experiment, num_updates, self._seed)
-            reporting.write_manifest(self.run_dir / "manifest.json", manifest)
-            self.rows = reporting.keep_rows_before(self.run_dir / "metrics.csv", self._start)
-            self._checkpoints = Checkpoints(self.run_dir / "checkpoints", self._keep_checkpoints)
-
-    def close(self) -> None:
-        """Waits for what is being written."""
-        if self._checkpoints:
-            if self._best:
-                self._save(self._best)
-            self._checkpoints.close()
-            self._checkpoints = None
-        if self.run_dir and self.rows:
-            draw_curve(self.run_dir, self._experiment, self.rows)
+        """Prepares the folders."""
+        for recorder in self.recorders:
+            recorder.open(num_updates)
 
     def chunk_length(self) -> int:
         """Number of updates that take about `SECONDS_PER_CHUNK`, 1 as long as that is unknown."""
@@ -208,115 +217,92 @@ class _Recorder:
 
     def record(self, chunk: _Chunk) -> None:
         """Waits for a chunk and takes down what came out of it."""
-        metrics = {name: x[: chunk.length] for name, x in jax.device_get(chunk.metrics).items()}
-        is_evaluated = chunk.start % self._experiment.eval_every == 0
-        _check_finite(metrics, chunk.start, is_evaluated)
-        record = {"wall_seconds": self._wall_seconds, "since_evaluation": self._since_evaluation}
-        training = {name: x for name, x in metrics.items() if not name.startswith("eval/")}
-        self._since_evaluation = {name: self._since_evaluation.get(name, []) for name in training}
-        score = None
-        if is_evaluated:
-            score = float(metrics[RETURN][0])
-            self._add_row(chunk.start, {name: float(x[0]) for name, x in metrics.items() if name not in training})
-        if chunk.state_before is not None:
-            self._consider(_Candidate(chunk.start, chunk.state_before, record, score))
-        self._since_evaluation = {
-            name: self._since_evaluation[name] + x.astype(float).tolist() for name, x in training.items()
-        }
-        self._measure(chunk)
-        self._progress.advance(chunk.start + chunk.length, self.rows[-1][RETURN] if self.rows else None)
-
-    def finish(self, update: int, train_state: TrainState, is_complete: bool) -> None:
-        """Evaluates and saves the state in which training ends."""
-        record = {"wall_seconds": self._wall_seconds, "since_evaluation": self._since_evaluation}
-        score = None
-        if is_complete:
-            evaluation = {name: float(x) for name, x in evaluate(self._experiment, train_state).items()}
-            _check_finite({name: np.array([x]) for name, x in evaluation.items()}, update, is_evaluated=True)
-            score = evaluation[RETURN]
-            self._add_row(update, evaluation)
-        if self._checkpoints:
-            self._last_save = -math.inf
-            self._consider(_Candidate(update, train_state, record, score))
-
-    def _add_row(self, update: int, evaluation: dict[str, float]) -> None:
-        """Evaluation of the policy at `update`, and means over the updates since the row before."""
-        means = {name: _nanmean(values) for name, values in self._since_evaluation.items()}
-        row = {
-            "update": update,
-            "agent_steps": update * self._experiment.agent_steps_per_update,
-            "wall_seconds": self._wall_seconds,
-            "seed": self._seed,
-        }
-        self.rows.append(row | evaluation | means)
-        self._since_evaluation = {name: [] for name in self._since_evaluation}
-        if self.run_dir:
-            reporting.append_row(self.run_dir / "metrics.csv", self.rows[-1])
-
-    def _consider(self, candidate: _Candidate) -> None:
-        """Saves the state if a checkpoint is due, after the best state so far; else remembers it if it is the best."""
-        assert self._checkpoints
-        best_score = self._best.score if self._best else self._checkpoints.best_score
-        if candidate.score is not None and (best_score is None or candidate.score > best_score):
-            self._best = candidate
-        if self.is_checkpoint_due():
-            if self._best:
-                self._save(self._best)
-            self._save(candidate)
-            self._best = None
+        metrics = jax.device_get(ensemble.fetch(self.batch, chunk.metrics))
+        metrics = {name: x[:, : chunk.length] for name, x in metrics.items()}
+        states = ensemble.fetch(self.batch, chunk.states_before)
+        for recorder, part in self._parts():
+            own = {name: x[part] for name, x in metrics.items()}
+            recorder.record(chunk.start, self._wall_seconds, own, _sliced(states, part))
+            if chunk.is_saved:
+                recorder.save()
+        if chunk.is_saved:
             self._last_save = time.monotonic()
-
-    def _save(self, candidate: _Candidate) -> None:
-        assert self._checkpoints
-        self._checkpoints.save(candidate.update, candidate.train_state, candidate.record, candidate.score)
-
-    def _measure(self, chunk: _Chunk) -> None:
+        self._report_diverged()
         now = time.monotonic() - self._started
-        if chunk.start > self._start:  # the first chunk includes compiling
+        if chunk.start > self.start:  # the first chunk includes compiling
             self._seconds_per_update = (now - self._wall_seconds) / chunk.length
         self._wall_seconds = now
+        returns = [x for recorder in self.recorders if (x := recorder.latest_return()) is not None]
+        self.progress.advance(chunk.start + chunk.length, float(np.median(returns)) if returns else None)
+
+    def finish(self, update: int, states: TrainState, is_complete: bool) -> None:
+        """Evaluates and saves the states in which training ends."""
+        evaluation = None
+        if is_complete:
+            evaluation = ensemble.fetch(self.batch, ensemble.evaluate_batch(self.batch, states))
+            evaluation = jax.device_get(evaluation)
+        states = ensemble.fetch(self.batch, states)
+        for recorder, part in self._parts():
+            own = None if evaluation is None else {name: x[part] for name, x in evaluation.items()}
+            recorder.finish(update, self._wall_seconds, _sliced(states, part), own)
+
+    def _parts(self) -> Iterator[tuple[Recorder, slice]]:
+        """Each recorder with its part of the axis of runs."""
+        size = self.batch.num_runs // len(self.recorders)
+        for index, recorder in enumerate(self.recorders):
+            yield recorder, slice(index * size, (index + 1) * size)
+
+    def _report_diverged(self) -> None:
+        """Says which seeds have diverged since the last time; raises if no other is left."""
+        diverged = [(recorder, seed) for recorder in self.recorders for seed in recorder.diverged]
+        if len(diverged) == self.batch.num_runs:
+            raise DivergedError(f"{diverged[-1][0].reason[diverged[-1][1]]}; training stopped")
+        for recorder, seed in diverged[self._num_reported :]:
+            where = f" of {recorder.run.run_dir}" if recorder.run.run_dir else ""
+            self.progress.warn(f"seed {seed}{where} stays as it was: {recorder.reason[seed]}")
+        self._num_reported = len(diverged)
 
 
-def draw_curve(run_dir: Path, experiment: Experiment, rows: list[Row]) -> None:
-    """Draws the learning curve of a run into its folder."""
-    title = f"{type(experiment.task).__name__}, {experiment.task.num_agents} agents"
-    reporting.draw_curve(run_dir / "curve.png", rows, title)
+def abstract_state(experiment: Experiment, num_seeds: int = 1) -> TrainState:
+    """Shapes and types of the states of so many seeds, without computing any."""
+    state = jax.eval_shape(init, experiment, jax.random.key(0))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_seeds, *x.shape), x.dtype), state)
 
 
-def abstract_state(experiment: Experiment) -> TrainState:
-    """Shapes and types of a state, without computing one."""
-    return jax.eval_shape(init, experiment, jax.random.key(0))
+def _restore(runs: Sequence[Run]) -> list[Restored] | None:
+    """Of each run the last checkpoint that all of them have; `None` if one of them has none."""
+    up_to = math.inf
+    while True:
+        found = []
+        for run in runs:
+            assert run.run_dir
+            template = abstract_state(run.experiment, len(run.seeds))
+            found.append(restore(run.run_dir / "checkpoints", template, up_to=up_to))
+        updates = [x.update if x else -1 for x in found]
+        if min(updates) == max(updates) or min(updates) < 0:
+            break
+        up_to = min(updates)
+    if jax.process_index() == 0:
+        for run in runs:
+            assert run.run_dir
+            set_aside_after(run.run_dir / "checkpoints", min(updates))
+    return None if min(updates) < 0 else found
 
 
-def _restore(experiment: Experiment, seed: int, run_dir: Path) -> Restored | None:
-    directory = run_dir / "checkpoints"
-    restored = restore(directory, abstract_state(experiment))
-    if restored:
-        set_aside_after(directory, restored.update)
-    return restored
+def _sliced(states: Any, part: slice) -> Any:
+    return jax.tree.map(lambda x: x[part], states)
 
 
-def _finished_rows(run_dir: Path | None, experiment: Experiment) -> list[Row]:
-    assert run_dir
-    rows = reporting.read_rows(run_dir / "metrics.csv")
-    if rows and not (run_dir / "curve.png").exists():
-        draw_curve(run_dir, experiment, rows)
+def _joined(restored: Sequence[Restored]) -> TrainState:
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *[x.train_state for x in restored])
+
+
+def _finished_rows(run: Run) -> list[Row]:
+    assert run.run_dir
+    rows = reporting.read_rows(run.run_dir / "metrics.csv")
+    if rows and not (run.run_dir / "curve.png").exists():
+        draw_curve(run, rows)
     return rows
-
-
-def _check_finite(metrics: dict[str, np.ndarray], start: int, is_evaluated: bool) -> None:
-    """Raises `DivergedError` for the first loss or return that is not a finite number."""
-    for name, values in metrics.items():
-        is_loss = name.startswith("learner/") and "loss" in name
-        checked = values if is_loss else values[: int(name == RETURN and is_evaluated)]
-        wrong = np.flatnonzero(~np.isfinite(checked))
-        if wrong.size:
-            raise DivergedError(f"{name} is {values[wrong[0]]} at update {start + wrong[0]}; training stopped")
-
-
-def _nanmean(values: list[float]) -> float:
-    finite = [x for x in values if not math.isnan(x)]
-    return math.fsum(finite) / len(finite) if finite else math.nan
 
 
 @contextlib.contextmanager

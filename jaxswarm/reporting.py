@@ -17,8 +17,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxswarm import curves, plots
 from jaxswarm.checkpoint import replace_text
 
+RETURN = "eval/return"
 Row = dict[str, Any]  # a line of metrics.csv; empty cells are NaN
 
 PACKAGES = ("jaxswarm", "jax", "jaxlib", "flax", "optax", "distrax", "orbax-checkpoint", "numpy")
@@ -27,7 +29,7 @@ LEADING = ("update", "agent_steps", "wall_seconds", "seed", "eval/return", "eval
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal to draw a bar on
 
 
-def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
+def manifest(experiment: Any, num_updates: int, seeds: Sequence[int]) -> dict[str, Any]:
     """Versions, device, revision and the exact arithmetic of steps."""
     per_update = experiment.agent_steps_per_update
     steps = {
@@ -51,7 +53,7 @@ def manifest(experiment: Any, num_updates: int, seed: int) -> dict[str, Any]:
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "command": sys.argv,
-        "seeds": [seed],
+        "seeds": list(seeds),
         "steps": steps,
     } | provenance()
 
@@ -117,33 +119,26 @@ def keep_rows_before(path: Path, update: int) -> list[Row]:
 
 
 def draw_curve(path: Path, rows: Sequence[Row], title: str) -> None:
-    """Evaluation return against agent steps, with the spread over episodes; the figure's format is the suffix."""
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    """Evaluation return against agent steps; the figure's format is the suffix.
 
-    points = [row for row in rows if math.isfinite(row["eval/return"])]
-    steps = np.array([row["agent_steps"] for row in points])
-    returns = np.array([row["eval/return"] for row in points])
-    spread = np.nan_to_num(np.array([row.get("eval/return_std", 0.0) for row in points]))
-    scale, unit = next(
-        ((s, u) for s, u in ((1e6, "million "), (1e3, "thousand ")) if steps.max(initial=0) >= s), (1, "")
-    )
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axes = figure.subplots()
-    axes.fill_between(steps / scale, returns - spread, returns + spread, color="#1f6f8b", alpha=0.18, linewidth=0)
-    axes.plot(steps / scale, returns, color="#1f6f8b", linewidth=1.8, marker="o", markersize=3)
-    if points:
-        axes.annotate(
-            f"{returns[-1]:.1f}", (steps[-1] / scale, returns[-1]), (6, 0), textcoords="offset points", va="center"
-        )
-    axes.set_xlabel(f"{unit}agent steps")
-    axes.set_ylabel("return of an episode (mean ± std)")
-    axes.set_title(title, loc="left", fontsize=11)
-    axes.grid(color="0.9")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    temporary = path.with_name(f".{path.name}.tmp")
-    figure.savefig(temporary, dpi=150, format=path.suffix[1:])
-    os.replace(temporary, path)
+    Of several seeds it shows the median with the quartiles, of one the mean with the standard deviation over episodes.
+    """
+    seeds, _ = curves.from_rows(rows, "agent_steps", RETURN)
+    if len(seeds) > 1:
+        line, what = curves.summarize(list(seeds.values()), "median"), f"median and quartiles of {len(seeds)} seeds"
+    else:
+        line, what = _mean_over_episodes(rows), "mean ± std"
+    label = f"return of an episode ({what})"
+    caption = "pale where some seeds have no evaluation" if np.unique(line.num_seeds).size > 1 else ""
+    series = [plots.Series("", line)]
+    plots.draw(path, plots.Picture("curve", series, "agent_steps", RETURN, label, title=title, caption=caption))
+
+
+def _mean_over_episodes(rows: Sequence[Row]) -> curves.Line:
+    points = [row for row in rows if math.isfinite(row[RETURN])]
+    x = np.array([row["agent_steps"] for row in points], float)
+    y, spread = (np.array([row.get(name, math.nan) for row in points], float) for name in (RETURN, f"{RETURN}_std"))
+    return curves.Line(x, y, y - spread, y + spread, np.ones(len(x), int))
 
 
 class Progress:
@@ -188,6 +183,13 @@ class Progress:
             self._last_line = now
             done = f"update {update}/{self._num_updates}"
             print(f"{done} · return {return_text} · {rate_text} · {left_text}", flush=True)
+
+    def warn(self, text: str) -> None:
+        """Prints a line, above the bar if there is one."""
+        if self._bar:
+            self._bar.console.print(f"warning: {text}", markup=False, highlight=False)
+        elif self._is_shown:
+            print(f"warning: {text}", flush=True)
 
     def _make_bar(self) -> Any:
         from rich import console, progress  # noqa: PLC0415

@@ -9,9 +9,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.types import Key, Metrics, Observation, Step, pytree
+
+WORLDS_AXIS = "worlds"  # of a mesh of devices
 
 PolicyFn = Callable[[Observation], Any]  # to a `distributions.Policy`
 
@@ -104,6 +107,18 @@ def collect(
     worlds, _, (episodes, returns, lengths) = carry
     metrics = {"episodes": episodes, "return": returns / episodes, "episode_length": lengths / episodes}
     return worlds, trajectory, metrics
+
+
+def spread_rows(tree: Any) -> Any:
+    """The tree with its rows spread over the devices that share worlds, if there are several."""
+    mesh = jax.sharding.get_abstract_mesh()
+    num_devices = dict(mesh.shape).get(WORLDS_AXIS, 1)
+
+    def spread(x: Array) -> Array:
+        is_even = num_devices > 1 and x.shape[0] % num_devices == 0
+        return jax.lax.with_sharding_constraint(x, PartitionSpec(WORLDS_AXIS)) if is_even else x
+
+    return jax.tree.map(spread, tree)
 
 
 def evaluate(key: Key, task: Any, policy: PolicyFn, num_worlds: int) -> Metrics:

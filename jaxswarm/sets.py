@@ -71,6 +71,7 @@ class Monoid(Protocol):
     """
 
     num_parts: ClassVar[int]
+    num_encoders: int
     reduction: ClassVar[str]
     lift: Callable[..., Summary]
     lower: Callable[[Summary], Array]

@@ -4,6 +4,7 @@
 (states from several keys) and over every number of the experiment that fixes no shape.
 """
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -61,6 +62,7 @@ class TrainState:
     key: Key
     learner: LearnerState
     worlds: Worlds
+    is_finite: Bool[Array, ""]  # False: numbers stopped being finite in the update after these, and the state stays
 
 
 @jax.jit
@@ -70,13 +72,14 @@ def init(experiment: Experiment, key: Key) -> TrainState:
     obs = experiment.task.observe(experiment.task.reset(obs_key))
     params = experiment.network.init(params_key, obs)
     worlds = rollout.start(worlds_key, experiment.task, experiment.num_worlds, experiment.desynchronised_start)
-    return TrainState(jnp.zeros((), jnp.int32), run_key, experiment.learner.init(params), worlds)
+    return TrainState(jnp.zeros((), jnp.int32), run_key, experiment.learner.init(params), worlds, jnp.array(True))
 
 
 @partial(jax.jit, static_argnames="num_updates")
 def train(experiment: Experiment, train_state: TrainState, num_updates: int) -> tuple[TrainState, Metrics]:
     """`num_updates` updates; the metrics have one row per update, NaN in `eval/...` where no evaluation was due.
 
+    Once a parameter, a loss or a return is not finite the state stays that before, and `is_finite` is 0 from there on.
     n calls with 1 update give the same bits as 1 call with n.
     """
     return train_chunk(experiment, train_state, num_updates, num_updates)
@@ -124,7 +127,22 @@ def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[Tra
     )
     metrics = eval_metrics | {f"train/{name}": x for name, x in train_metrics.items()}
     metrics |= {f"learner/{name}": x for name, x in learner_metrics.items()}
-    return TrainState(state.update + 1, state.key, learner, worlds), metrics
+    after = TrainState(state.update + 1, state.key, learner, worlds, state.is_finite)
+    is_finite = state.is_finite & _are_finite(learner.params, metrics)
+    kept = jax.tree.map(lambda a, b: jnp.where(is_finite, a, b), after, state)
+    return dataclasses.replace(kept, is_finite=is_finite), metrics | {"is_finite": is_finite.astype(jnp.float32)}
+
+
+def _are_finite(params: Any, metrics: Metrics) -> Bool[Array, ""]:
+    """Parameters and losses; and the return, where there was an evaluation."""
+    losses = {name: x for name, x in metrics.items() if is_loss(name)}
+    checks = jax.tree.map(lambda x: jnp.isfinite(x).all(), (params, losses))
+    return jax.tree.reduce(jnp.logical_and, checks, ~jnp.isinf(metrics["eval/return"]))
+
+
+def is_loss(name: str) -> bool:
+    """Whether the metric of this name has to be finite at every update."""
+    return name.startswith("learner/") and "loss" in name
 
 
 def _evaluate_if(is_due: Bool[Array, ""], experiment: Experiment, state: TrainState) -> Metrics:

@@ -201,7 +201,8 @@ def run_dir(tmp_path_factory):
         config = configs.compose(TINY)
         (run_dir / "config.yaml").write_text(configs.dump(config))
         checkpoints = Checkpoints(run_dir / "checkpoints")
-        checkpoints.save(1, init(configs.build(config), jax.random.key(0)), {}, -3.0)
+        state = init(configs.build(config), jax.random.key(0))
+        checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
         checkpoints.close()
         yield run_dir
     jax.config.update("jax_compilation_cache_dir", None)

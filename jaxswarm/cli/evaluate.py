@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import load_policy, require_fit, which_checkpoint
+from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
 from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
-jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [task.key=value[,value...]] ...
+jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [train_seed=N] [task.key=value[,value...]] ...
 
 Evaluates the trained policy of a run folder, also on changed tasks: prints a table and writes JSON into the folder.
-The action is the mean of the policy; each episode is played in a world of its own.
+The action is the mean of the policy; each episode is played in a world of its own. Of a run with several seeds all
+policies are evaluated, or that of train_seed; the table has means over them, the file has each.
 
 examples
   jaxswarm-eval runs/thesis
@@ -31,7 +32,9 @@ def main(arguments: Sequence[str]) -> int:
         print(HELP)
         return 0 if arguments else 2
     paths = [word for word in arguments if "=" not in word]
-    options, words = split([word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed"))
+    options, words = split(
+        [word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed", "train_seed")
+    )
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
     which = which_checkpoint(options)
@@ -40,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
     seed = whole("seed", options.get("seed", 0), 0)
     changes = configs.combinations(words)
     only(changes[0], lambda key: key.startswith("task."), "task.<field>=value")
-    asked = {"which": which, "seed": seed, "episodes": episodes}
+    asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": which_seeds(options, config)}
     result = _evaluate(Path(paths[0]), config, changes, asked)
     return _report(Path(paths[0]), result) if result else 1
 
@@ -52,12 +55,13 @@ def _evaluate(
     tasks = [configs.override(config, pairs)["task"] for pairs in changes]
     built = [configs.build_part("task", {"task": task}) for task in tasks]
     use_compile_cache()
-    policy = load_policy(run_dir, config, asked["which"])
-    if policy is None:
+    policies = load_policies(run_dir, config, asked["which"], asked["train_seeds"])
+    if policies is None:
         return None
     for task in built:
-        require_fit(policy, task)
+        require_fit(policies, task)
     import jax  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
 
     from jaxswarm import rollout  # noqa: PLC0415
 
@@ -65,15 +69,19 @@ def _evaluate(
 
     @jax.jit
     def play(params: Any, task: Any) -> dict[str, Any]:
-        act: Any = functools.partial(policy.network.apply, params, method="policy")
-        return rollout.evaluate(key, task, act, asked["episodes"])
+        def episodes(params: Any) -> dict[str, Any]:
+            policy: Any = functools.partial(policies.network.apply, params, method="policy")
+            return rollout.evaluate(key, task, policy, asked["episodes"])
 
-    played = [{name: float(x) for name, x in play(policy.params, task).items()} for task in built]
-    results = [
-        {"changed": dict(pairs), "task": task, "metrics": metrics}
-        for pairs, task, metrics in zip(changes, tasks, played, strict=True)
-    ]
-    found = {"update": policy.update, "score_in_training": policy.score, "device": jax.devices()[0].device_kind}
+        return jax.lax.map(episodes, params)
+
+    results = []
+    for pairs, task, with_leaves in zip(changes, tasks, built, strict=True):
+        of_seeds = {name: np.float64(x) for name, x in play(policies.params, with_leaves).items()}
+        means = {name: float(x.mean()) for name, x in of_seeds.items()}
+        each = {name: x.tolist() for name, x in of_seeds.items()}
+        results.append({"changed": dict(pairs), "task": task, "metrics": means, "of_each_seed": each})
+    found = {"update": policies.update, "score_in_training": policies.score, "device": jax.devices()[0].device_kind}
     return asked | found | {"results": results}
 
 
@@ -84,7 +92,11 @@ def _report(run_dir: Path, result: dict[str, Any]) -> int:
     while (path := run_dir / f"{name}.json").exists():
         name += "x"
     replace_text(path, json.dumps(result, indent=2) + "\n")
-    print(f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes")
+    num_seeds = len(result["train_seeds"])
+    seeds = f" of each of {num_seeds} seeds; means" if num_seeds > 1 else ""
+    print(
+        f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes{seeds}"
+    )
     print(_table(result["results"]))
     print(f"wrote {path}")
     return 0

@@ -1,18 +1,19 @@
 """The program `jaxswarm-render`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import load_policy, require_fit, which_checkpoint
+from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
 from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
-jaxswarm-render PATH [PATH ...] [out=FILE] [checkpoint=best|last] [seed=N] [task.key=value] ...
+jaxswarm-render PATH [PATH ...] [out=FILE] [checkpoint=best|last] [seed=N] [train_seed=N] [task.key=value] ...
 
-Plays an episode of each run's policy, side by side, and writes it in the format of the suffix of `out`:
+Plays an episode of each run's policy, side by side, and writes it in the format of the suffix of `out`. `seed` is that
+of the episode; of a run with several seeds it is the policy of the first, or of train_seed.
   .html  one page that needs no network: play, scrub, click an agent to see what it looks at (default: replay.html)
   .png   a strip of frames=N pictures (6), evenly spaced up to step until=N (the end)
   .gif   a moving picture of frames=N pictures (150), up to step until=N
@@ -23,7 +24,7 @@ examples
   jaxswarm-render runs/mean runs/bayesian seed=3 out=compared.html
   jaxswarm-render runs/thesis task.num_agents=200 out=strip.png frames=6 until=200
 """
-OPTIONS = ("out", "checkpoint", "seed", "frames", "until")
+OPTIONS = ("out", "checkpoint", "seed", "train_seed", "frames", "until")
 
 
 @program
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     options, words = split([word for word in arguments if "=" in word], OPTIONS)
     if not paths:
         raise ConfigError("give at least one run folder: jaxswarm-render PATH [key=value ...]")
-    which, seed = which_checkpoint(options), whole("seed", options.get("seed", 0), 0)
+    seed = whole("seed", options.get("seed", 0), 0)
     sizes = {name: whole(name, options[name], 1) for name in ("frames", "until") if name in options}
     pairs = configs.parse(words)
     only(pairs, lambda key: key.startswith("task."), "task.<field>=value")
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str]) -> int:
 
     try:
         render.check(out, **sizes)
-        films = [_film(path, pairs, which, seed) for path in paths]
+        films = [_film(path, pairs, options, seed, len(paths)) for path in paths]
         if None in films:
             return 1
         render.write(out, films, **sizes)
@@ -60,15 +61,19 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _film(run_dir: Path, pairs: Sequence[tuple[str, Any]], which: str, seed: int) -> Any:
-    """An episode of the policy of a run; `None` if it cannot be restored."""
-    config = configs.override(load(run_dir), pairs)
-    task = configs.build_part("task", config)
-    policy = load_policy(run_dir, load(run_dir), which)
-    if policy is None:
+def _film(
+    run_dir: Path, pairs: Sequence[tuple[str, Any]], options: Mapping[str, str], seed: int, num_films: int
+) -> Any:
+    """An episode of the policy of a run; `None` if it cannot be restored. All films together stay below the limit."""
+    config = load(run_dir)
+    task = configs.build_part("task", configs.override(config, pairs))
+    trained = which_seeds(options, config)[:1]
+    policies = load_policies(run_dir, config, which_checkpoint(options), trained)
+    if policies is None:
         return None
-    require_fit(policy, task)
+    require_fit(policies, task)
     from jaxswarm import render  # noqa: PLC0415
 
-    title = f"{run_dir.name}, {render.describe(task)}, after update {policy.update}"
-    return render.record(task, policy.network, policy.params, seed=seed, title=title)
+    title = f"{run_dir.name}, {render.describe(task)}, after update {policies.update}"
+    params, limit = render.of_seed(policies.params, 0), render.MAX_SHARES // num_films
+    return render.record(task, policies.network, params, seed=seed, title=title, max_shares=limit)

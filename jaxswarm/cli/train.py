@@ -21,6 +21,7 @@ examples
   jaxswarm-train
   jaxswarm-train aggregator=bayesian learner.learning_rate=3e-4 task.num_agents=10 seed=3
   jaxswarm-train experiment=rendezvous_thesis run_dir=runs/thesis
+  jaxswarm-train task=pursuit num_seeds=16
   jaxswarm-train resume=runs/thesis num_updates=320
 """
 
@@ -75,25 +76,38 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool) -> int:
             experiment,
             num_updates,
             seed=run.seed,
+            num_seeds=run.num_seeds,
             run_dir=run_dir,
             resume=is_resumed,
             checkpoint_seconds=run.checkpoint_seconds,
             keep_checkpoints=run.keep_checkpoints,
+            log_to=run.loggers,
+            config=config,
         )
     except (DivergedError, CheckpointError) as error:
         print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
         return 1
-    update = int(train_state.update)
+    update = int(train_state.update.max())
     if update < num_updates:
         print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
         return 0
     from jaxswarm import render  # noqa: PLC0415
 
-    render.write_replay(run_dir, experiment, train_state.learner.params, update=update)
+    render.write_replay(run_dir, experiment, render.of_seed(train_state.learner.params, 0), update=update)
     if rows:
-        print(f"done: {update} updates, return {rows[-1]['eval/return']:.2f} (untrained {rows[0]['eval/return']:.2f})")
+        first, last = (_return_at(rows, rows[index]["update"]) for index in (0, -1))
+        print(f"done: {update} updates, return {last} (untrained {first})")
     print(f"{_files(run_dir)}\nnext: {command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
     return 0
+
+
+def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
+    """The return of an evaluation; of several seeds the median and the quartiles."""
+    import numpy as np  # noqa: PLC0415
+
+    returns = [row["eval/return"] for row in rows if row["update"] == update]
+    low, median, high = np.percentile(returns, [25, 50, 75])
+    return f"{median:.2f}" if len(returns) == 1 else f"{median:.2f} [{low:.2f}, {high:.2f}] over {len(returns)} seeds"
 
 
 def _keys_help() -> str:
@@ -123,9 +137,11 @@ def _default_run_dir(config: Config) -> str:
 def _summary(config: Config, experiment: Any, num_updates: int, run_dir: Path) -> str:
     names = ", ".join(config[part]["name"] for part in ("task", "aggregator", "learner"))
     per_update = experiment.agent_steps_per_update
+    seeds = configs.run_settings(config).seeds
+    seeds = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]} side by side"
     return (
         f"{names}: {experiment.task.num_agents} agents, {num_updates} updates of {per_update:,} agent steps "
-        f"({num_updates * per_update:,} in all), seed {config['seed']}\nrun folder: {run_dir}"
+        f"({num_updates * per_update:,} in all), {seeds}\nrun folder: {run_dir}"
     )
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxswarm.rollout import Trajectory
+from jaxswarm.rollout import Trajectory, spread_rows
 from jaxswarm.types import Key, Metrics, Observation, is_whole, pytree, require, static
 
 Params = Any
@@ -263,7 +263,7 @@ def descend(
         return {name: (jnp.max if name.endswith("_max") else jnp.mean)(x) for name, x in metrics.items()}
 
     def minibatch(state: State, units: Int[Array, " units"]) -> tuple[State, Metrics]:
-        gradient, metrics = jax.grad(loss, has_aux=True)(state.params, fetch(units))
+        gradient, metrics = jax.grad(loss, has_aux=True)(state.params, spread_rows(fetch(units)))
         updates, optimizer_state = optimizer.update(gradient, state.optimizer_state, state.params)
         metrics["gradient_norm"] = optax.tree.norm(gradient)
         params = optax.apply_updates(state.params, updates)

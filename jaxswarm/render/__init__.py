@@ -6,11 +6,25 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from jaxswarm.render import page, pictures
-from jaxswarm.render.film import Film, record
+from jaxswarm.render.film import MAX_SHARES, Film, record
 from jaxswarm.render.pictures import RenderError
 
-__all__ = ["FORMATS", "Film", "RenderError", "check", "describe", "hook", "record", "write", "write_replay"]
+__all__ = [
+    "FORMATS",
+    "MAX_SHARES",
+    "Film",
+    "RenderError",
+    "check",
+    "describe",
+    "hook",
+    "of_seed",
+    "record",
+    "write",
+    "write_replay",
+]
 
 
 def _write_page(path: Path, films: Sequence[Film]) -> None:
@@ -53,6 +67,11 @@ def write(path: Path, films: Sequence[Film], **options: int) -> None:
 def describe(task: Any) -> str:
     """The task and the size of its swarm, for titles."""
     return f"{type(task).__name__.lower()} of {task.num_agents} agents"
+
+
+def of_seed(params: Any, index: int) -> Any:
+    """The parameters of one of the seeds that were trained side by side."""
+    return jax.tree.map(lambda leaf: leaf[index], params)
 
 
 def write_replay(run_dir: Path, experiment: Any, params: Any, *, update: int, name: str = "replay.html") -> Path | None:

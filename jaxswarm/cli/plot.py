@@ -1,0 +1,307 @@
+"""The program `jaxswarm-plot`."""
+
+import csv
+import dataclasses
+import difflib
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxswarm import curves, plots, runs
+from jaxswarm.checkpoint import replace_text
+from jaxswarm.cli.words import program, wants_help, whole
+from jaxswarm.config import ConfigError
+from jaxswarm.curves import STATISTICS, Curve, Line
+from jaxswarm.plots import Picture, Series
+from jaxswarm.runs import RunFolder
+
+HELP = """\
+jaxswarm-plot PATH... [out=FILE.png] [key=value ...]
+
+Draws learning curves of runs with their spread over seeds, and writes the points as CSV beside the picture. A PATH is
+a run folder or a folder that holds some. Runs that differ in nothing but seed, length, checkpoints and times of
+evaluation are one group; the groups are named by what they differ in.
+
+  out=plot.png             .png, .svg or .pdf
+  kind=curve               curve; profile: how many seeds end above each return; threshold: how many reached one, when
+  threshold=VALUE          of kind=threshold
+  statistic=median         median with quartiles; iqm: interquartile mean with 95 % stratified bootstrap intervals
+  y=eval/return            any column of metrics.csv
+  x=agent_steps            agent_steps, wall_seconds or update
+  log=                     logarithmic axes: x, y or xy
+  smooth=N                 each evaluation averaged with the N-1 before it, seed by seed
+  reference=FILE.csv,...   curves to compare with: columns series, agent_steps, median, q25, q75
+  series=TEXT              only those series of the references whose names contain the text
+  title=TEXT
+
+examples
+  jaxswarm-plot runs
+  jaxswarm-plot runs/a runs/b out=figure.pdf statistic=iqm log=x
+  jaxswarm-plot runs kind=threshold threshold=-30 x=wall_seconds
+"""
+REFERENCE_COLUMNS = ("series", "agent_steps", "median", "q25", "q75")
+NAMES = {"eval/return": "return of an episode"}
+UNITS = {"agent_steps": "agent steps", "wall_seconds": "seconds", "update": "updates"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to draw, and where."""
+
+    out: str = ""
+    kind: str = "curve"
+    threshold: str = ""
+    statistic: str = "median"
+    y: str = "eval/return"
+    x: str = "agent_steps"
+    log: str = ""
+    smooth: str = "1"
+    reference: str = ""
+    series: str = ""
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        for name, accepted in CHOICES.items():
+            if getattr(self, name) not in accepted:
+                choices = ", ".join(filter(None, accepted))
+                raise ConfigError(f"{name} = {getattr(self, name)!r} is not possible; accepted: {choices}")
+        whole("smooth", self.smooth, 1)
+        if self.kind == "threshold" and not _is_number(self.threshold):
+            raise ConfigError(f"threshold = {self.threshold!r} is not possible; accepted: a number, like threshold=-30")
+        if self.threshold and self.kind != "threshold":
+            raise ConfigError(f"threshold = {self.threshold} has no meaning here; accepted with kind=threshold")
+        if self.statistic != Options.statistic and self.kind != "curve":
+            raise ConfigError(f"statistic = {self.statistic} has no meaning here; accepted with kind=curve")
+        if self.reference and (self.kind, self.x) != ("curve", "agent_steps"):
+            raise ConfigError("reference has no meaning here; accepted with kind=curve and x=agent_steps")
+        if self.series and not self.reference:
+            raise ConfigError("series has no meaning here; accepted with reference=FILE.csv")
+        if self.log and self.kind != "curve" and (self.log, self.kind) != ("x", "threshold"):
+            raise ConfigError(f"log = {self.log} is not possible with kind={self.kind}; accepted with kind=curve")
+
+
+@program
+def main(arguments: Sequence[str]) -> int:
+    """Draws a picture of runs; returns the exit code."""
+    if wants_help(arguments) or not arguments:
+        print(HELP)
+        return 0 if arguments else 2
+    options, paths = _parse(arguments)
+    out = _output(options.out)
+    references = [series for name in options.reference.split(",") if name for series in _reference(Path(name), options)]
+    groups = _groups([runs.read(path) for path in runs.find(paths)], options)
+    title = options.title or (_shared_name(groups) if len(groups) > 1 else "")
+    picture = KINDS[options.kind](_seeds(groups, options), options)
+    caption = picture.caption + ("; dashed: references, median and quartiles" if references else "")
+    series = [*picture.series, *references]
+    picture = dataclasses.replace(picture, series=series, title=title, caption=caption, log=options.log)
+    _write(out, picture)
+    for series in picture.series:
+        if not series.is_reference:
+            print(f"{series.label}: {series.note}")
+    print(f"wrote {out}\nwrote {out.with_suffix('.csv')}")
+    return 0
+
+
+def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
+    """Options, and paths; what exists is a path, whatever is in its name."""
+    names = [field.name for field in dataclasses.fields(Options)]
+    options, paths = {}, []
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        if equals and name in names:
+            if not value:
+                raise ConfigError(f"{name} has no value")
+            options[name] = value
+        elif equals and not Path(word).exists():
+            near = "".join(f"did you mean {x!r}? " for x in difflib.get_close_matches(name, names, n=1))
+            raise ConfigError(f"unknown key {name!r}; {near}accepted: {', '.join(names)}")
+        else:
+            paths.append(Path(word))
+    if not paths:
+        raise ConfigError("give a run folder, or a folder that holds some: jaxswarm-plot PATH... [key=value ...]")
+    return Options(**options), paths
+
+
+def _output(out: str) -> Path:
+    """Where the picture goes; a `ConfigError` if that, or the table beside it, would replace something else."""
+    path = Path(out or "plot.png")
+    table = path.with_suffix(".csv")
+    if path.suffix[1:].lower() not in plots.FORMATS:
+        raise ConfigError(f"out = {out!r} is not possible; accepted: {', '.join(f'FILE.{x}' for x in plots.FORMATS)}")
+    if path.is_dir() or table.is_dir():
+        raise ConfigError(f"out = {out!r} is not possible: there is a folder of that name")
+    is_ours = table.exists() and table.read_bytes().startswith(",".join(plots.COLUMNS).encode())
+    if table.exists() and not is_ours:
+        raise ConfigError(f"out = {path} would replace {table}, which is no table of this program; choose another name")
+    if not out and path.exists() and not is_ours:
+        raise ConfigError(f"{path} exists and is no picture of this program; choose a name with out=FILE.png")
+    return path
+
+
+def _reference(path: Path, options: Options) -> list[Series]:
+    """The curves of a CSV file; the legend says which file they come from and of how many runs they are."""
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise ConfigError(f"cannot read reference={path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"cannot read reference={path}: {error}") from error
+    missing = [name for name in REFERENCE_COLUMNS if not rows or name not in rows[0]]
+    if missing:
+        raise ConfigError(f"reference={path} has no column {missing[0]}; it needs {', '.join(REFERENCE_COLUMNS)}")
+    names = list(dict.fromkeys(row["series"] for row in rows))
+    chosen = [name for name in names if options.series.lower() in name.lower()]
+    if not chosen:
+        raise ConfigError(f"series = {options.series!r} is not in {path}; accepted: parts of {', '.join(names)}")
+    return [_reference_series(path, name, [row for row in rows if row["series"] == name]) for name in chosen]
+
+
+def _reference_series(path: Path, name: str, rows: Sequence[Mapping[str, str]]) -> Series:
+    try:
+        table = [[float(row[column] or "nan") for column in REFERENCE_COLUMNS[1:]] for row in rows]
+        num_runs = [int(row.get("n_runs") or 0) for row in rows]
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"cannot read reference={path}: {error}") from error
+    source = f"{path.stem}, {num_runs[0]} runs" if num_runs[0] else path.stem
+    x, middle, lower, upper = np.array(table).T
+    if not np.isfinite(x).all():
+        raise ConfigError(f"cannot read reference={path}: agent_steps of {name!r} are not all numbers")
+    return Series(name, Line(x, middle, lower, upper, np.array(num_runs)), source, is_reference=True)
+
+
+def _groups(folders: Sequence[RunFolder], options: Options) -> dict[str, list[RunFolder]]:
+    """The groups of runs, once it is known that there is something to draw of them."""
+    columns = sorted({name for folder in folders for row in folder.rows[:1] for name in row} - {"seed"})
+    if not columns:
+        raise ConfigError("the runs have no evaluation yet")
+    for key in ("x", "y"):
+        name = getattr(options, key)
+        if name not in columns:
+            near = "".join(f"did you mean {x!r}? " for x in difflib.get_close_matches(name, columns, n=1))
+            raise ConfigError(f"{key} = {name!r} does not exist; {near}accepted: {', '.join(columns)}")
+    return runs.group(folders)
+
+
+def _seeds(groups: Mapping[str, Sequence[RunFolder]], options: Options) -> dict[str, list[Curve]]:
+    """Each group's curves, smoothed if asked for; groups without any are left out."""
+    found = {label: runs.seeds(members, options.x, options.y, _warn) for label, members in groups.items()}
+    size = int(options.smooth)
+    found = {label: [curves.trailing_mean(x, size) for x in seeds] for label, seeds in found.items() if seeds}
+    if not found:
+        raise ConfigError(f"nothing to draw: no run has a finite {options.y}")
+    return found
+
+
+def _curve(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
+    statistic = STATISTICS[options.statistic]
+    lines = {label: curves.summarize(seeds, options.statistic) for label, seeds in groups.items()}
+    series = []
+    for label, line in lines.items():
+        most, last = int(line.num_seeds.max()), int(line.num_seeds[-1])
+        series.append(Series(label, line, _count(most) + (f", {last} at the end" if last < most else "")))
+    caption = f"{statistic.name} and {statistic.band} over seeds".capitalize()
+    if any(np.ptp(line.num_seeds) for line in lines.values()):
+        caption += "; pale where not all seeds have values"
+    height = f"{options.statistic} of {options.y}"
+    return Picture("curve", series, options.x, height, _name(options), caption=_smoothed(caption, options))
+
+
+def _profile(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
+    finals = {label: np.array([curve.y[-1] for curve in seeds]) for label, seeds in groups.items()}
+    at = np.unique(np.concatenate(list(finals.values())))
+    margin = 0.05 * (np.ptp(at) or abs(at[0]) or 1.0)
+    at = np.concatenate([[at[0] - margin], at, [at[-1] + margin]])
+    series = [Series(label, curves.profile(x, at), _count(len(x))) for label, x in finals.items()]
+    ends = [curve.x[-1] for seeds in groups.values() for curve in seeds]
+    caption = f"Last evaluation of each seed, at {_amount(max(ends), options.x)}"
+    caption += f" (the first to end: {_amount(min(ends), options.x)})" if min(ends) < max(ends) else ""
+    caption = _smoothed(f"{caption}; 95 % stratified bootstrap intervals", options)
+    fraction = "fraction of seeds that end above"
+    return Picture("profile", series, _name(options), fraction, fraction, caption=caption, is_step=True)
+
+
+def _threshold(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
+    threshold, series = float(options.threshold), []
+    for label, seeds in groups.items():
+        times, is_reached = curves.times_to(seeds, threshold)
+        line = curves.reaching(seeds, threshold)
+        half = line.x[line.y >= 0.5]
+        when = f"half by {_amount(half[0], options.x)}" if half.size else "fewer than half"
+        note = f"{is_reached.sum()} of {_count(len(seeds))}, {when}"
+        series.append(Series(label, line, note, censored=np.sort(times[~is_reached])))
+    fraction = f"fraction of seeds that reached {options.threshold}"
+    caption = f"{_name(options)}, first evaluation at or above {options.threshold}".capitalize()
+    caption += "; Kaplan-Meier estimate with 95 % intervals; ticks: seeds that ended before"
+    caption = _smoothed(caption, options)
+    return Picture("threshold", series, options.x, fraction, fraction, caption=caption, is_step=True)
+
+
+KINDS: dict[str, Callable[[Mapping[str, Sequence[Curve]], Options], Picture]] = {
+    "curve": _curve,
+    "profile": _profile,
+    "threshold": _threshold,
+}
+
+
+CHOICES = {
+    "kind": tuple(KINDS),
+    "statistic": tuple(STATISTICS),
+    "x": ("agent_steps", "wall_seconds", "update"),
+    "log": ("", "x", "y", "xy"),
+}
+
+
+def _write(out: Path, picture: Picture) -> None:
+    try:
+        plots.check(picture)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if "x" in picture.log:
+        hidden = sum(int((series.line.x <= 0).sum()) for series in picture.series)
+        if hidden:
+            _warn(f"a logarithmic axis has no place for {picture.x_name} = 0; points left out: {hidden}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        replace_text(out.with_suffix(".csv"), plots.table(picture))
+        plots.draw(out, picture)
+    except OSError as error:
+        raise ConfigError(f"cannot write to {out.parent}: {error.strerror}") from error
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
+def _shared_name(groups: Mapping[str, Sequence[RunFolder]]) -> str:
+    return runs.common_name([members[0].config for members in groups.values()])
+
+
+def _name(options: Options) -> str:
+    """What `y` is called in words."""
+    return NAMES.get(options.y, options.y)
+
+
+def _count(number: int) -> str:
+    return "1 seed" if number == 1 else f"{number} seeds"
+
+
+def _smoothed(caption: str, options: Options) -> str:
+    return caption + (f"; means of {options.smooth} evaluations" if int(options.smooth) > 1 else "")
+
+
+def _amount(value: float, name: str) -> str:
+    """A number of the horizontal axis in words."""
+    size, unit = (1e6, "million ") if value >= 1e6 else (1, "")
+    return f"{value / size:,.4g} {unit}{UNITS[name]}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False

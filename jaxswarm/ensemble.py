@@ -1,0 +1,191 @@
+"""Many runs of one shape in one program: several seeds, several numbers, spread over all devices.
+
+A batch of runs is an `Experiment` and a `TrainState` whose leaves have one more axis, the first, of runs. Each device
+has its share of the runs and trains `width` of them at a time, side by side, one such group after the other. Where
+there are more devices than runs, the worlds of a run are spread over several: arithmetic is that of one device, and
+XLA adds up gradients across devices.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import psutil
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Int, UInt
+
+from jaxswarm.rollout import WORLDS_AXIS
+from jaxswarm.training import Experiment, TrainState, evaluate, init, train_chunk
+from jaxswarm.types import Metrics
+
+RUNS_AXIS = "runs"
+CPU_WIDTH = 1  # runs side by side on a CPU, whose cache holds the activations of one; measured, see benchmarks/LOG.md
+MEMORY_SHARE = 0.9  # of what is free that a program may take
+
+Program = Callable[[Experiment, TrainState, Int[Array, ""]], tuple[TrainState, Metrics]]
+
+
+class Batch(NamedTuple):
+    """Runs in one program."""
+
+    experiments: Experiment  # leaves [runs]
+    mesh: Mesh | None  # over the devices; None: there is one
+
+    @property
+    def num_runs(self) -> int:
+        """How many."""
+        return jax.tree.leaves(self.experiments)[0].shape[0]
+
+
+def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> Batch:
+    """`num_seeds` runs of each experiment, one after the other; the experiments differ in numbers only."""
+    leaves = [jax.tree.leaves(experiment) for experiment in experiments]
+    structures = {jax.tree.structure(experiment) for experiment in experiments}
+    if len(structures) > 1:
+        raise ValueError("experiments differ in what fixes a program's shapes; accepted: such as differ in numbers")
+    stacked = [jnp.repeat(jnp.asarray(x, jnp.float32), num_seeds) for x in zip(*leaves, strict=True)]
+    batch = jax.tree.unflatten(structures.pop(), stacked)
+    return Batch(batch, make_mesh(len(experiments) * num_seeds, experiments[0].num_worlds))
+
+
+def make_mesh(num_runs: int, num_worlds: int) -> Mesh | None:
+    """As many devices as divide runs and worlds, `None` if that is one; several processes need all of theirs."""
+    num_devices = jax.device_count()
+    shapes = [
+        (runs, math.gcd(num_worlds, num_devices // runs))
+        for runs in range(1, num_devices + 1)
+        if num_runs % runs == 0 and num_devices % runs == 0
+    ]
+    runs, worlds = max(shapes, key=lambda shape: (math.prod(shape), shape))
+    if jax.process_count() > 1 and runs * worlds < num_devices:
+        raise ValueError(
+            f"{num_runs} runs of {num_worlds} worlds cannot be spread over {num_devices} devices; "
+            "accepted: numbers of runs or worlds that they divide"
+        )
+    if runs * worlds == 1:
+        return None
+    axes = (AxisType.Auto, AxisType.Auto)
+    return jax.make_mesh((runs, worlds), (RUNS_AXIS, WORLDS_AXIS), axes, devices=jax.devices()[: runs * worlds])
+
+
+def place(batch: Batch, states: TrainState) -> TrainState:
+    """The states where the batch is computed."""
+    mesh = batch.mesh
+    if mesh is None:
+        return jax.device_put(states)
+    by_run, by_world = (NamedSharding(mesh, spec) for spec in (P(RUNS_AXIS), P(RUNS_AXIS, WORLDS_AXIS)))
+    spread = jax.tree.map(lambda _: by_run, states)
+    spread = spread.replace(worlds=jax.tree.map(lambda _: by_world, states.worlds))
+    return jax.device_put(states, spread)
+
+
+def init_batch(batch: Batch, seeds: Sequence[int]) -> TrainState:
+    """States before the first update, one for each run; those of the same seeds alone, bit by bit."""
+
+    return place(batch, _start(batch.experiments, jnp.asarray(seeds, jnp.uint32)))
+
+
+@jax.jit
+def _start(experiments: Experiment, seeds: UInt[Array, " runs"]) -> TrainState:
+    return jax.lax.map(lambda run: init(run[0], jax.random.key(run[1])), (experiments, seeds))
+
+
+def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[str], None]) -> Program:
+    """`train_chunk` of every run, donating the states; as many runs side by side as memory holds."""
+    num_local = batch.num_runs // (batch.mesh.shape[RUNS_AXIS] if batch.mesh else 1)
+    width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
+    while width > 1:
+        with _on(batch):
+            program = _advance.lower(batch.experiments, states, jnp.int32(0), size, width, batch.mesh).compile()
+        needed, free = _memory(program), _free_memory()
+        if free is None or needed <= free:
+            return program
+        smaller = [n for n in range(1, width) if num_local % n == 0]
+        width = max(n for n in smaller if n == 1 or n <= width * free / needed)
+        warn(
+            f"{num_local} runs side by side need {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
+            f"{width} at a time"
+        )
+
+    def program(experiments: Experiment, states: TrainState, num_updates: Array) -> tuple[TrainState, Metrics]:
+        with _on(batch):
+            return _advance(experiments, states, num_updates, size, width, batch.mesh)
+
+    return program
+
+
+@partial(jax.jit, static_argnames=("size", "width", "mesh"), donate_argnames="states")
+def _advance(
+    experiments: Experiment, states: TrainState, num_updates: Array, size: int, width: int, mesh: Mesh | None
+) -> tuple[TrainState, Metrics]:
+    return _spread(mesh, partial(train_chunk, size=size), width)(experiments, states, num_updates)
+
+
+def evaluate_batch(batch: Batch, states: TrainState) -> Metrics:
+    """`evaluate` of every run; metrics [runs]."""
+    with _on(batch):
+        return _evaluate(batch.experiments, states, batch.mesh)
+
+
+@partial(jax.jit, static_argnames="mesh")
+def _evaluate(experiments: Experiment, states: TrainState, mesh: Mesh | None) -> Metrics:
+    return _spread(mesh, evaluate, 1)(experiments, states)
+
+
+def fetch(batch: Batch, tree: Any) -> Any:
+    """The tree on this process's own device, wherever its parts are; a call that all processes have to make."""
+    if jax.process_count() == 1 or batch.mesh is None:
+        return tree
+    everywhere = jax.jit(lambda x: x, out_shardings=NamedSharding(batch.mesh, P()))(tree)
+    return jax.tree.map(lambda x: x.addressable_data(0), everywhere)
+
+
+def _on(batch: Batch) -> contextlib.AbstractContextManager:
+    return contextlib.nullcontext() if batch.mesh is None else jax.set_mesh(batch.mesh)
+
+
+def _spread(mesh: Mesh | None, function: Callable, width: int) -> Callable:
+    """The function of one run, and of what is common to all, for all runs; each device takes those that it has."""
+
+    def local(experiments: Experiment, states: TrainState, *common: Array) -> Any:
+        def one(run: tuple[Experiment, TrainState]) -> Any:
+            return function(*run, *common)
+
+        runs, num_local = (experiments, states), states.update.shape[0]
+        if num_local == 1:  # no loop: exactly the program of one run
+            return jax.tree.map(lambda x: x[None], one(jax.tree.map(lambda x: x[0], runs)))
+        if width == num_local:
+            return jax.vmap(one)(runs)
+        return jax.lax.map(one, runs, batch_size=None if width == 1 else width)
+
+    if mesh is None:
+        return local
+    by_run = P(RUNS_AXIS)
+
+    def spread(experiments: Experiment, states: TrainState, *common: Array) -> Any:
+        specs = (by_run, by_run, *[P()] * len(common))
+        return jax.shard_map(
+            local, mesh=mesh, in_specs=specs, out_specs=by_run, axis_names={RUNS_AXIS}, check_vma=False
+        )(experiments, states, *common)
+
+    return spread
+
+
+def _memory(program: Any) -> int:
+    """Bytes that a device needs to run it."""
+    analysis = program.memory_analysis()
+    sizes = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
+    return sizes - analysis.alias_size_in_bytes
+
+
+def _free_memory() -> float | None:
+    """Bytes that a program may take on each device; `None` if that is not known."""
+    if jax.default_backend() == "cpu":
+        return MEMORY_SHARE * psutil.virtual_memory().available / jax.local_device_count()
+    stats = jax.local_devices()[0].memory_stats()
+    return MEMORY_SHARE * (stats["bytes_limit"] - stats["bytes_in_use"]) if stats else None

@@ -1,0 +1,194 @@
+"""What becomes of one run while it is trained: rows, the files in its folder, checkpoints."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxswarm import reporting
+from jaxswarm.checkpoint import Checkpoints, Restored
+from jaxswarm.loggers import LOGGERS, Logger
+from jaxswarm.reporting import Row
+from jaxswarm.training import Experiment, TrainState, is_loss
+
+RETURN = "eval/return"
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """An experiment and its seeds, which are trained side by side; with a folder, files are written into it."""
+
+    experiment: Experiment
+    seeds: tuple[int, ...] = (0,)
+    run_dir: Path | None = None
+    loggers: tuple[str, ...] = ()  # names in `LOGGERS`, which need a folder
+    config: Mapping[str, Any] | None = None  # what the loggers show of it
+
+
+@dataclasses.dataclass
+class _Candidate:
+    """A state that may be saved, and what else continues the run from there."""
+
+    update: int
+    states: TrainState  # leaves [seeds, ...]
+    record: dict[str, Any]
+    score: float | None
+
+
+class Recorder:
+    """Takes down what came out of updates, in order. Arrays are [seeds, ...], in the order of the run's seeds."""
+
+    def __init__(self, run: Run, restored: Restored | None, keep_checkpoints: int):
+        record: dict[str, Any] = restored.record if restored else {}
+        self.run = run
+        self.rows: list[Row] = []
+        self.reason: dict[int, str] = {int(seed): x for seed, x in record.get("diverged", {}).items()}
+        self._since_evaluation: dict[str, list[list[float]]] = record.get("since_evaluation", {})  # [updates][seeds]
+        self._start = restored.update if restored else 0
+        self._keep_checkpoints = keep_checkpoints
+        self._checkpoints: Checkpoints | None = None
+        self._loggers: dict[int, list[Logger]] = {}
+        self._last: _Candidate | None = None
+        self._best: _Candidate | None = None  # better than all on disk, and not yet there
+
+    def open(self, num_updates: int) -> None:
+        """Prepares the run folder; called once the device is at work."""
+        run_dir = self.run.run_dir
+        if run_dir:
+            run_dir.mkdir(parents=True, exist_ok=True)
+            manifest = reporting.manifest(self.run.experiment, num_updates, self.run.seeds)
+            reporting.write_manifest(run_dir / "manifest.json", manifest)
+            self.rows = reporting.keep_rows_before(run_dir / "metrics.csv", self._start)
+            self._checkpoints = Checkpoints(run_dir / "checkpoints", self._keep_checkpoints)
+            for seed in self.run.seeds:
+                self._loggers[seed] = [LOGGERS[name](run_dir, self.run.config, seed) for name in self.run.loggers]
+
+    def close(self) -> None:
+        """Waits for what is being written."""
+        if self._checkpoints:
+            if self._best:
+                self._save(self._best)
+            self._checkpoints.close()
+            self._checkpoints = None
+        for logger in (x for loggers in self._loggers.values() for x in loggers):
+            logger.close()
+        self._loggers = {}
+        if self.run.run_dir and self.rows:
+            draw_curve(self.run, self.rows)
+
+    def record(
+        self, start: int, wall_seconds: float, metrics: dict[str, np.ndarray], states: TrainState | None
+    ) -> None:
+        """Metrics [seeds, updates] of the updates from `start` on; `states` before them, if they may be saved."""
+        evaluation = {name: x[:, 0] for name, x in metrics.items() if name.startswith("eval/")}
+        training = {name: x for name, x in metrics.items() if name not in evaluation and name != "is_finite"}
+        is_evaluated = start % self.run.experiment.eval_every == 0
+        record = self._to_continue(wall_seconds)
+        self._since_evaluation = {name: self._since_evaluation.get(name, []) for name in training}
+        if is_evaluated:
+            self._add_rows(start, wall_seconds, evaluation)
+        if states is not None and self._checkpoints:
+            self._consider(_Candidate(start, states, record, self._score(evaluation) if is_evaluated else None))
+        for name, x in training.items():
+            self._since_evaluation[name] = self._since_evaluation[name] + x.T.astype(float).tolist()
+        self._note_diverged(start, metrics)
+
+    def finish(
+        self, update: int, wall_seconds: float, states: TrainState, evaluation: dict[str, np.ndarray] | None
+    ) -> None:
+        """Saves the states in which training ends; metrics [seeds] of their evaluation, if it has reached its end."""
+        record = self._to_continue(wall_seconds)
+        if evaluation is not None:
+            self._add_rows(update, wall_seconds, evaluation)
+        if self._checkpoints:
+            score = None if evaluation is None else self._score(evaluation)
+            self._consider(_Candidate(update, states, record, score))
+            self.save()
+
+    def save(self) -> None:
+        """Writes the best states, if they are not on disk, and the last ones."""
+        for candidate in (self._best, self._last):
+            if candidate:
+                self._save(candidate)
+        self._best = None
+
+    def latest_return(self) -> float | None:
+        """Median over the seeds of the last evaluation."""
+        latest = [row[RETURN] for row in self.rows if row["update"] == self.rows[-1]["update"]]
+        return float(np.median(latest)) if latest else None
+
+    def _note_diverged(self, start: int, metrics: dict[str, np.ndarray]) -> None:
+        for index, seed in enumerate(self.run.seeds):
+            wrong = np.flatnonzero(metrics["is_finite"][index] == 0)
+            if wrong.size and seed not in self.reason:
+                of_update = {name: x[index, wrong[0]] for name, x in metrics.items()}
+                self.reason[seed] = _reason(of_update, start + int(wrong[0]))
+
+    @property
+    def diverged(self) -> list[int]:
+        """Seeds that stay as they were before their numbers stopped being finite, for a `reason` each."""
+        return list(self.reason)
+
+    def _score(self, evaluation: dict[str, np.ndarray]) -> float | None:
+        """Mean return over the seeds that have not diverged."""
+        returns = [x for seed, x in zip(self.run.seeds, evaluation[RETURN], strict=True) if seed not in self.reason]
+        score = float(np.mean(returns, dtype=float)) if returns else math.nan
+        return score if math.isfinite(score) else None
+
+    def _to_continue(self, wall_seconds: float) -> dict[str, Any]:
+        diverged = {str(seed): reason for seed, reason in self.reason.items()}
+        return {"wall_seconds": wall_seconds, "since_evaluation": self._since_evaluation, "diverged": diverged}
+
+    def _add_rows(self, update: int, wall_seconds: float, evaluation: dict[str, np.ndarray]) -> None:
+        """Evaluations of the policies at `update`, and means over the updates since the rows before."""
+        for index, seed in enumerate(self.run.seeds):
+            if seed in self.reason or not np.isfinite(evaluation[RETURN][index]):
+                continue
+            means = {name: _nanmean([x[index] for x in values]) for name, values in self._since_evaluation.items()}
+            row = {
+                "update": update,
+                "agent_steps": update * self.run.experiment.agent_steps_per_update,
+                "wall_seconds": wall_seconds,
+                "seed": seed,
+            }
+            self.rows.append(row | {name: float(x[index]) for name, x in evaluation.items()} | means)
+            if self.run.run_dir:
+                reporting.append_row(self.run.run_dir / "metrics.csv", self.rows[-1])
+            for logger in self._loggers.get(seed, []):
+                logger.log(self.rows[-1])
+        self._since_evaluation = {name: [] for name in self._since_evaluation}
+
+    def _consider(self, candidate: _Candidate) -> None:
+        """Remembers the states as the last ones, and as the best ones if they are."""
+        assert self._checkpoints
+        best_score = self._best.score if self._best else self._checkpoints.best_score
+        if candidate.score is not None and (best_score is None or candidate.score > best_score):
+            self._best = candidate
+        self._last = candidate
+
+    def _save(self, candidate: _Candidate) -> None:
+        assert self._checkpoints
+        self._checkpoints.save(candidate.update, candidate.states, candidate.record, candidate.score)
+
+
+def draw_curve(run: Run, rows: Sequence[Row]) -> None:
+    """Draws the learning curve of a run into its folder."""
+    assert run.run_dir
+    title = f"{type(run.experiment.task).__name__}, {run.experiment.task.num_agents} agents"
+    reporting.draw_curve(run.run_dir / "curve.png", rows, title)
+
+
+def _reason(metrics: dict[str, Any], update: int) -> str:
+    """Which number stopped being finite."""
+    for name, value in metrics.items():
+        if not np.isfinite(value) and (is_loss(name) or (name == RETURN and np.isinf(value))):
+            return f"{name} is {value} at update {update}"
+    return f"a parameter is not finite at update {update}"
+
+
+def _nanmean(values: list[float]) -> float:
+    finite = [x for x in values if not math.isnan(x)]
+    return math.fsum(finite) / len(finite) if finite else math.nan

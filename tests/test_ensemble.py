@@ -1,0 +1,168 @@
+"""Seeds, numbers and devices side by side: what each run gets does not depend on its company."""
+
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxswarm
+from jaxswarm import checkpoint, config, ensemble, reporting
+from jaxswarm.fit import DivergedError, abstract_state, fit, fit_runs
+from jaxswarm.recording import Run
+
+WORDS = (
+    "task.num_agents=3 task.episode_length=5 num_worlds=4 num_steps=4 learner.batch_size=24 eval_worlds=2 eval_every=3 "
+    "network.encoder=[4] network.decoder=[4]"
+)
+EXPERIMENT = config.build(config.compose(WORDS.split()))
+DIVERGING = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
+OPTIONS = {"progress": False, "checkpoint_seconds": 0.0}
+
+
+def assert_same(found, expected, atol=0.0):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            a, b = jax.random.key_data(a), jax.random.key_data(b)  # noqa: PLW2901
+        np.testing.assert_allclose(a, b, atol=atol, rtol=0)
+
+
+def one(states, index):
+    return jax.tree.map(lambda x: x[index], states)
+
+
+@pytest.fixture(scope="module")
+def three_seeds(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("runs") / "three"
+    return *fit(EXPERIMENT, 10, seed=5, num_seeds=3, run_dir=run_dir, **OPTIONS), run_dir
+
+
+def test_each_seed_is_the_single_run_of_that_seed_bit_by_bit(three_seeds):
+    states, rows, _ = three_seeds
+    for index, seed in ((0, 5), (2, 7)):
+        alone, alone_rows = fit(EXPERIMENT, 10, seed=seed, progress=False)
+        assert_same(one(states, index), alone)
+        returns = [row["eval/return"] for row in rows if row["seed"] == seed]
+        assert returns == [row["eval/return"] for row in alone_rows]
+
+
+def test_rows_keep_seeds_apart(three_seeds):
+    _, rows, run_dir = three_seeds
+    assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 6, 9, 10) for s in (5, 6, 7)]
+    on_disk = reporting.read_rows(run_dir / "metrics.csv")
+    np.testing.assert_array_equal(*[np.float32([row["eval/return"] for row in x]) for x in (on_disk, rows)])
+    assert json.loads((run_dir / "manifest.json").read_text())["seeds"] == [5, 6, 7]
+
+
+def test_several_seeds_resume_to_the_same_end(three_seeds, tmp_path):
+    states, _, run_dir = three_seeds
+    fit(EXPERIMENT, 4, seed=5, num_seeds=3, run_dir=tmp_path / "run", **OPTIONS)
+    resumed, _ = fit(EXPERIMENT, 10, seed=5, num_seeds=3, run_dir=tmp_path / "run", resume=True, **OPTIONS)
+    assert_same(resumed, states)
+    lines = [(path / "metrics.csv").read_text().splitlines() for path in (run_dir, tmp_path / "run")]
+    without_time = [[line.split(",")[:2] + line.split(",")[3:] for line in x] for x in lines]
+    assert without_time[0] == without_time[1]
+
+
+@pytest.mark.slow
+def test_side_by_side_by_vmap_is_the_same_to_rounding(three_seeds, monkeypatch):
+    monkeypatch.setattr(ensemble, "CPU_WIDTH", 3)
+    states, _ = fit(EXPERIMENT, 10, seed=5, num_seeds=3, progress=False)
+    assert_same(states.learner.params, three_seeds[0].learner.params, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time(monkeypatch):
+    monkeypatch.setattr(ensemble, "CPU_WIDTH", 4)
+    monkeypatch.setattr(ensemble, "_free_memory", lambda: 1e3)
+    batch, said = ensemble.make_batch([EXPERIMENT], 4), []
+    states = ensemble.init_batch(batch, range(4))
+    ensemble.compile_batch(batch, states, 3, said.append)
+    assert len(said) == 1
+    assert said[0].startswith("4 runs side by side need")
+    assert said[0].endswith("1 at a time")
+
+
+@pytest.fixture(scope="module")
+def with_a_diverging_run(tmp_path_factory):
+    """Two runs of two seeds in one program, of which one diverges."""
+    runs_dir = tmp_path_factory.mktemp("runs")
+    runs = [Run(x, (5, 6), runs_dir / name) for x, name in ((EXPERIMENT, "good"), (DIVERGING, "bad"))]
+    return *fit_runs(runs, 10, **OPTIONS), runs
+
+
+@pytest.mark.slow
+def test_a_diverging_run_is_frozen_and_the_others_go_on(with_a_diverging_run, three_seeds):
+    states, (good, bad), runs = with_a_diverging_run
+    for index in (0, 1):
+        assert_same(one(states, index), one(three_seeds[0], index))
+    assert [row["update"] for row in good if row["seed"] == 5] == [0, 3, 6, 9, 10]
+    assert {row["update"] for row in bad} == {0}
+    assert np.asarray(states.is_finite).tolist() == [True, True, False, False]
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(states.learner.params))
+    restored = checkpoint.restore(runs[1].run_dir / "checkpoints", abstract_state(EXPERIMENT, 2))
+    assert restored.record["diverged"].keys() == {"5", "6"}
+
+
+@pytest.mark.slow
+def test_runs_of_several_experiments_resume_together(with_a_diverging_run, tmp_path):
+    states, _, runs = with_a_diverging_run
+    shorter = [Run(run.experiment, run.seeds, tmp_path / run.run_dir.name) for run in runs]
+    fit_runs(shorter, 4, **OPTIONS)
+    fit_runs(shorter[:1], 7, resume=True, **OPTIONS)  # one is further than the other
+    resumed, (good, _) = fit_runs(shorter, 10, resume=True, **OPTIONS)
+    assert_same(resumed, states)
+    assert [row["update"] for row in good if row["seed"] == 6] == [0, 3, 6, 9, 10]
+
+
+def test_when_all_seeds_diverge_training_stops():
+    with pytest.raises(DivergedError, match="training stopped"):
+        fit(DIVERGING, 10, num_seeds=2, progress=False)
+
+
+def test_experiments_of_other_shapes_cannot_be_side_by_side():
+    with pytest.raises(ValueError, match="differ in numbers"):
+        ensemble.make_batch([EXPERIMENT, EXPERIMENT.replace(num_steps=6)], 1)
+
+
+SPREAD = """
+import sys, jax, numpy as np
+from jaxswarm import ensemble
+from tests_config import EXPERIMENT, train
+num_runs = int(sys.argv[1])
+states, mesh = train(num_runs)
+assert dict(mesh.shape) == {"runs": int(sys.argv[2]), "worlds": int(sys.argv[3])}, mesh
+np.savez(sys.argv[4], *map(np.asarray, jax.tree.leaves(states.learner.params)))
+"""
+CONFIG = f"""
+import jax, jax.numpy as jnp
+from jaxswarm import config, ensemble
+EXPERIMENT = config.build(config.compose({WORDS.split()!r}))
+def train(num_runs):
+    batch = ensemble.make_batch([EXPERIMENT], num_runs)
+    states = ensemble.init_batch(batch, range(5, 5 + num_runs))
+    program = ensemble.compile_batch(batch, states, 3, print)
+    for _ in range(4):
+        states, metrics = program(batch.experiments, states, jnp.int32(3))
+    assert all(len(x.sharding.device_set) == batch.mesh.size for x in jax.tree.leaves(states.worlds))
+    return states, batch.mesh
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("num_runs", "mesh"), [(8, (8, 1)), (2, (2, 4)), (1, (1, 4))])
+def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):
+    (tmp_path / "tests_config.py").write_text(CONFIG)
+    flags = "--xla_force_host_platform_device_count=8"
+    found = tmp_path / "found.npz"
+    command = [sys.executable, "-c", SPREAD, str(num_runs), *map(str, mesh), str(found)]
+    subprocess.run(command, env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(tmp_path)}, check=True, timeout=300)
+    for index in range(num_runs):
+        state = jaxswarm.init(EXPERIMENT, jax.random.key(5 + index))
+        expected = jax.tree.leaves(jaxswarm.train(EXPERIMENT, state, 12)[0].learner.params)
+        for a, b in zip(np.load(found).values(), expected, strict=True):
+            np.testing.assert_allclose(a[index], b, atol=1e-5)

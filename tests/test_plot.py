@@ -1,0 +1,248 @@
+import csv
+import math
+import xml.etree.ElementTree
+
+import numpy as np
+import pytest
+
+from jaxswarm import config as configs
+from jaxswarm import plots, reporting
+from jaxswarm.cli import plot
+from jaxswarm.curves import Line
+
+SEEDS = {  # returns of the evaluations at 0, 500, 1000, ... agent steps
+    "mean": {0: [-9.0, -5.0, -1.0], 1: [-8.0, -3.0, -2.0], 2: [-7.0, -6.0]},
+    "max": {5: [-9.0, -8.0, -4.0], 6: [-9.0, -7.0, -3.0]},
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A folder with two groups, of three seeds and of two."""
+    path = tmp_path_factory.mktemp("runs")
+    config = configs.compose()
+    for name, seeds in SEEDS.items():
+        (path / name).mkdir()
+        (path / name / "config.yaml").write_text(configs.dump(config | {"aggregator": {"name": name}}))
+        for seed, values in seeds.items():
+            for i, value in enumerate(values):
+                row = {"update": i, "agent_steps": i * 500, "wall_seconds": i + seed / 8, "seed": seed}
+                row |= {"eval/return": value, "learner/policy_loss": 1 / i if i else math.nan}
+                reporting.append_row(path / name / "metrics.csv", row)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def reference(tmp_path):
+    path = tmp_path / "figure.csv"
+    lines = ["A (small),4,0,-8,-9,-7", "A (small),4,900,-1,,", "B,5,0,-7,-8,-6", "B,5,900,-2,-3,-1"]
+    path.write_text("\n".join(["series,n_runs,agent_steps,median,q25,q75", *lines]) + "\n")
+    return path
+
+
+def read(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def text_of(path):
+    """All words of an SVG picture."""
+    return " ".join(" ".join(element.itertext()) for element in xml.etree.ElementTree.parse(path).iter())
+
+
+def test_a_picture_of_a_folder_of_runs_says_how_many_seeds_and_what_the_band_is(runs, capsys):
+    assert plot.main([str(runs), "out=a/b.svg"]) == 0
+    out, err = capsys.readouterr()
+    assert out.splitlines() == [
+        "aggregator=max: 2 seeds",
+        "aggregator=mean: 3 seeds, 2 at the end",
+        "wrote a/b.svg",
+        "wrote a/b.csv",
+    ]
+    assert not err
+    words = text_of("a/b.svg")
+    expected = [
+        "aggregator=mean (3 seeds, 2 at the end)",
+        "aggregator=max (2 seeds)",
+        "Median and quartiles over seeds",
+    ]
+    expected += ["rendezvous, ppo", "return of an episode", "thousand agent steps", "pale where not all seeds"]
+    assert all(text in words for text in expected), words
+
+
+def test_the_table_holds_what_is_drawn(runs):
+    assert plot.main([str(runs), "out=x.svg"]) == 0
+    rows = read("x.csv")
+    assert list(rows[0]) == list(plots.COLUMNS)
+    assert {(row["kind"], row["x_name"], row["y_name"]) for row in rows} == {
+        ("curve", "agent_steps", "median of eval/return")
+    }
+    mean = [row for row in rows if row["series"] == "aggregator=mean"]
+    assert [(float(row["x"]), int(row["num_seeds"])) for row in mean] == [(0, 3), (500, 3), (1000, 2)]
+    values = [[float(row[name]) for name in ("lower", "y", "upper")] for row in mean]
+    there = [[-9, -8, -7], [-5, -3, -6], [-1, -2]]
+    np.testing.assert_allclose(values, [np.percentile(x, [25, 50, 75]) for x in there])
+
+
+@pytest.mark.parametrize(("name", "start"), [("X.PNG", b"\x89PNG"), ("x.svg", b"<?xml"), ("a.b.pdf", b"%PDF")])
+def test_the_suffix_is_the_format(runs, tmp_path, name, start):
+    assert plot.main([str(runs / "mean"), f"out={name}"]) == 0
+    path = tmp_path / name
+    assert path.read_bytes().startswith(start)
+    assert {x.name for x in tmp_path.iterdir()} == {name, path.with_suffix(".csv").name}
+
+
+def test_the_same_picture_is_the_same_file(runs, tmp_path):
+    files = []
+    for _ in range(2):
+        assert plot.main([str(runs), "out=x.svg", "statistic=iqm"]) == 0
+        files.append((tmp_path / "x.svg").read_text())
+    assert files[0] == files[1]
+    assert "<dc:date>" not in files[0]
+
+
+def test_a_previous_picture_is_replaced(runs, tmp_path):
+    for group in ("mean", "max"):
+        assert plot.main([str(runs / group)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"plot.png", "plot.csv"}
+    assert {row["series"] for row in read("plot.csv")} == {"rendezvous, max, ppo"}
+
+
+def test_the_interquartile_mean_over_the_time_with_logarithmic_axes(runs, capsys):
+    words = ["statistic=iqm", "x=wall_seconds", "log=xy", "smooth=2", "title=What $ is_seen"]
+    assert plot.main([str(runs), *words, "out=x.svg"]) == 0
+    assert "no place for wall_seconds = 0; points left out: 1" in capsys.readouterr().err
+    words = text_of("x.svg")
+    expected = ["What $ is_seen", "95 % stratified bootstrap interval", "means of 2 evaluations", "seconds"]
+    assert all(text in words for text in expected), words
+    assert "rendezvous" not in words
+    rows = [row for row in read("x.csv") if row["series"] == "aggregator=max"]
+    assert [float(row["x"]) for row in rows] == [0.625, 0.75, 1.625, 1.75, 2.625, 2.75]
+    assert float(rows[1]["y"]) == pytest.approx((-9 + (-9 + 0.125 * 0.5)) / 2)
+
+
+def test_another_column_may_be_drawn(runs, capsys):
+    assert plot.main([str(runs / "max"), "y=learner/policy_loss", "x=update", "out=x.svg"]) == 0
+    captured = capsys.readouterr()
+    assert not captured.err
+    assert [float(row["y"]) for row in read("x.csv")] == [1, 0.5]
+    assert "learner/policy_loss" in text_of("x.svg")
+
+
+def test_a_profile_of_the_last_evaluations(runs):
+    assert plot.main([str(runs), "kind=profile", "out=x.svg"]) == 0
+    rows = [row for row in read("x.csv") if row["series"] == "aggregator=mean"]
+    points = {float(row["x"]): float(row["y"]) for row in rows}
+    assert [points[x] for x in (-6, -4, -3, -2, -1)] == pytest.approx([2 / 3, 2 / 3, 2 / 3, 1 / 3, 0])
+    assert max(points.values()) == 1
+    words = text_of("x.svg")
+    assert all(text in words for text in ("at 1,000 agent steps", "the first to end: 500 agent steps")), words
+
+
+def test_the_times_to_a_threshold_with_seeds_that_never_got_there(runs, capsys):
+    assert plot.main([str(runs), "kind=threshold", "threshold=-3.5", "out=x.svg"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == "aggregator=max: 1 of 2 seeds, half by 1,000 agent steps"
+    assert out[1] == "aggregator=mean: 2 of 3 seeds, half by 1,000 agent steps"
+    rows = read("x.csv")
+    assert [(row["series"], float(row["x"])) for row in rows if row["kind"] == "censored"] == [
+        ("aggregator=max", 1000),
+        ("aggregator=mean", 500),
+    ]
+    mean = {float(row["x"]): float(row["y"]) for row in rows if row["series"] == "aggregator=mean"}
+    assert mean == pytest.approx({0: 0, 500: 1 / 3, 1000: 1})
+    assert "2 of 3 seeds" in text_of("x.svg")
+
+
+def test_references_are_drawn_with_their_source(runs, reference):
+    assert plot.main([str(runs), f"reference={reference},{reference}", "series=small", "out=x.svg"]) == 0
+    rows = [row for row in read("x.csv") if row["kind"] == "reference"]
+    assert [row["series"] for row in rows] == ["A (small)"] * 4
+    assert [(row["num_seeds"], row["x"], row["y"], row["lower"]) for row in rows[:2]] == [
+        ("4", "0.0", "-8.0", "-9.0"),
+        ("4", "900.0", "-1.0", ""),
+    ]
+    words = text_of("x.svg")
+    assert "A (small) (figure, 4 runs)" in words
+    assert "dashed: references, median and quartiles" in words
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["kind=pie"], ["kind = 'pie'", "curve, profile, threshold"]),
+        (["statistic=mode"], ["statistic = 'mode'", "median, iqm"]),
+        (["x=time"], ["x = 'time'", "wall_seconds"]),
+        (["y=eval/retrun"], ["did you mean 'eval/return'", "learner/policy_loss"]),
+        (["y=seed"], ["y = 'seed' does not exist"]),
+        (["log=z"], ["log = 'z'", "x, y, xy"]),
+        (["log=y", "y=update"], ["log = y is not possible", "0 to 2"]),
+        (["log=y", "kind=profile"], ["log = y is not possible with kind=profile"]),
+        (["kind=profile", "statistic=iqm"], ["statistic = iqm has no meaning here"]),
+        (["smooth=0"], ["smooth = 0", "integers from 1"]),
+        (["kind=threshold"], ["threshold = ''", "threshold=-30"]),
+        (["threshold=3"], ["kind=threshold"]),
+        (["out=x.jpg"], ["out = 'x.jpg'", "FILE.png, FILE.svg, FILE.pdf"]),
+        (["out="], ["out has no value"]),
+        (["output=x.png"], ["unknown key 'output'", "did you mean 'out'"]),
+        (["nowhere"], ["nowhere is not a folder"]),
+        (["reference=none.csv"], ["reference=none.csv", "No such file"]),
+        (["reference={reference}", "series=C"], ["series = 'C'", "A (small), B"]),
+        (["reference={reference}", "x=update"], ["kind=curve and x=agent_steps"]),
+        (["series=C"], ["accepted with reference"]),
+        (["reference={runs}/mean/metrics.csv"], ["has no column series"]),
+        (["out=figure.png"], ["would replace figure.csv"]),
+    ],
+)
+def test_a_wrong_command_is_one_line_and_writes_nothing(runs, reference, tmp_path, capsys, words, parts):
+    words = [word.format(reference=reference, runs=runs) for word in words]
+    assert plot.main([str(runs), *words]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert all(part in captured.err for part in parts), captured.err
+    assert list(tmp_path.iterdir()) == [reference]
+
+
+def test_a_picture_that_is_not_ours_is_kept(runs, tmp_path, capsys):
+    (tmp_path / "plot.png").write_text("a map of the garden")
+    assert plot.main([str(runs)]) == 2
+    assert "choose a name with out=" in capsys.readouterr().err
+    assert (tmp_path / "plot.png").read_text() == "a map of the garden"
+
+
+def test_a_command_without_runs_is_answered(capsys):
+    assert plot.main([]) == 2
+    assert plot.main(["--help"]) == 0
+    assert "jaxswarm-plot PATH..." in capsys.readouterr().out
+    assert plot.main(["log=x"]) == 2
+    assert "give a run folder" in capsys.readouterr().err
+
+
+def test_evaluations_that_are_not_finite_are_left_out_and_told(runs, tmp_path, capsys):
+    folder = tmp_path / "diverged"
+    folder.mkdir()
+    (folder / "config.yaml").write_text((runs / "mean" / "config.yaml").read_text())
+    (folder / "metrics.csv").write_text("update,agent_steps,seed,eval/return\n0,0,4,-9.0\n1,500,4,\n2,1000,4,inf\n")
+    assert plot.main([str(folder), "out=x.png"]) == 0
+    out, err = capsys.readouterr()
+    assert err == f"warning: {folder}: 2 evaluations left out, eval/return is not a finite number there\n"
+    assert out.startswith("rendezvous, mean, ppo: 1 seed\n")
+    assert [row["y"] for row in read("x.csv")] == ["-9.0"]
+
+
+def test_many_series_share_no_colour_and_marker():
+    line = Line(*np.arange(12.0).reshape(4, 3), np.ones(3, int))
+    series = [plots.Series(f"group {i}", line) for i in range(20)]
+    picture = plots.Picture("curve", series, "update", "y", "y")
+    drawn = []
+    original = plots._draw_line
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plots, "_draw_line", lambda *words: (drawn.append(words[-1]), original(*words)))
+        plots.draw(plot.Path("many.svg"), picture)
+    assert len({(style["color"], style["marker"]) for style in drawn}) == 20
