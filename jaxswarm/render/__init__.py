@@ -37,6 +37,7 @@ FORMATS: dict[str, Callable[..., None]] = {
     ".gif": pictures.write_gif,
     ".mp4": pictures.write_mp4,
 }
+# What `write` may be told of each format, whole numbers from 1
 OPTIONS = {".html": (), ".png": ("frames", "until"), ".gif": ("frames", "until"), ".mp4": ("until",)}
 
 
@@ -53,7 +54,7 @@ def check(path: Path, **options: int) -> None:
 
 
 def write(path: Path, films: Sequence[Film], **options: int) -> None:
-    """Writes films in the format of the suffix, as a whole or not at all; options are those of `FORMATS`."""
+    """Writes films in the format of the suffix, as a whole or not at all; the options are in `OPTIONS`."""
     check(path, **options)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
