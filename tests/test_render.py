@@ -2,7 +2,6 @@
 
 import base64
 import dataclasses
-import functools
 import json
 import re
 import shutil
@@ -15,8 +14,8 @@ import pytest
 from films import episode
 from PIL import Image
 
-from jaxswarm import TASKS, ActorCritic, render
 from jaxswarm import config as configs
+from jaxswarm import render
 from jaxswarm.checkpoint import Checkpoints
 from jaxswarm.cli import render as program
 from jaxswarm.distributions import gaussian
@@ -32,33 +31,6 @@ TINY = [
 ]
 
 
-@functools.cache
-def played(seed):
-    """An episode of a task in which one of three agents does not take part, by an untrained network."""
-    task = TASKS["rendezvous"](num_agents=3, episode_length=9, active_agents=(2, 2))
-    network = ActorCritic((4,), (4,))
-    obs = Observation(jnp.zeros((3, 3)), {"neighbors": Entities(jnp.zeros((3, 2, 8)), jnp.ones((3, 2), bool))})
-    params = jax.jit(network.init)(jax.random.key(0), obs)
-    return render.record(task, network, params, seed=seed, title="test", max_shares=5 * 9)
-
-
-def test_a_film_is_an_episode_with_its_rewards():
-    """Which are the distance of the two agents, but for the effort of up to 0.001."""
-    film = played(0)
-    assert film.num_frames == 10
-    assert film.score[0] == 0
-    distance = np.linalg.norm(film.scenes.agents.position[:, 0] - film.scenes.agents.position[:, 1], axis=-1)
-    np.testing.assert_allclose(np.diff(film.score), -distance[1:] / (100 * 2**0.5), atol=0.001)
-    assert (film.scenes.agents.position[0] != played(1).scenes.agents.position[0]).any()
-
-
-def test_shares_are_kept_of_so_many_frames_and_by_the_number_of_the_body():
-    film = played(0)
-    assert film.shares_every == 2
-    assert film.shares.shape == (5, 3, 3)
-    np.testing.assert_allclose(film.shares[0, :2], [[np.nan, 1, np.nan], [1, np.nan, np.nan]])
-
-
 @pytree
 class Clock:
     time: jax.Array
@@ -66,39 +38,54 @@ class Clock:
 
 @pytree
 class Countdown:
-    """A task that is over after `length` steps."""
+    """A task that is over after `length` steps; the reward is their number. Nobody sees the third of its agents."""
 
     length: int = 4
-    num_agents: int = static(default=1)
+    num_agents: int = static(default=3)
     episode_length: int = static(default=9)
 
     def reset(self, key):
         return Clock(jnp.zeros((), jnp.int32))
 
     def step(self, key, state, action):
-        over = state.time + 1 >= self.length
-        return Clock(state.time + 1), Step(jnp.ones(()), over, over, {})
+        is_over = state.time + 1 >= self.length
+        return Clock(state.time + 1), Step(state.time + 1.0, is_over, is_over, {})
 
     def observe(self, state):
-        return state
+        mask = self.slots(state)["neighbors"] < 2
+        return Observation(jnp.zeros((3, 1)), {"neighbors": Entities(jnp.zeros((3, 2, 1)), mask)})
+
+    def slots(self, state):
+        return {"neighbors": jnp.array([[1, 2], [2, 0], [0, 1]])}
 
     def scene(self, state):
-        agents = Bodies(jnp.full((1, 2), state.time), jnp.ones(1, bool))
+        agents = Bodies(jnp.full((3, 2), state.time), jnp.ones(3, bool))
         return Scene(jnp.zeros(2), jnp.ones(2), False, agents)
 
 
 class Standing:
-    """A network that does nothing."""
+    """A network that does nothing, and tells of weights."""
 
     def apply(self, params, obs, method):
-        return gaussian(jnp.zeros((1, 2)), jnp.zeros((1, 2)))
+        if method == "weights":
+            return {"neighbors": jnp.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]])}
+        return gaussian(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
 
 
 def test_a_film_ends_where_the_episode_ends():
     film = render.record(Countdown(), Standing(), None, max_shares=1)
-    np.testing.assert_array_equal(film.score, [0, 1, 2, 3, 4])
+    np.testing.assert_array_equal(film.score, [0, 1, 3, 6, 10])
     np.testing.assert_array_equal(film.scenes.agents.position[:, 0, 0], [0, 1, 2, 3, 4])
     assert film.shares is None  # two frames of them would be too large
+
+
+@pytest.mark.parametrize(("length", "kept"), [(100, 5), (4, 3)])
+def test_shares_are_kept_of_so_many_frames_and_by_the_number_of_the_body(length, kept):
+    film = render.record(Countdown(length), Standing(), None, max_shares=5 * 9)
+    assert film.num_frames == min(length, 9) + 1
+    assert film.shares_every == 2
+    expected = [[np.nan, 1, np.nan], [1, np.nan, np.nan], [0.25, 0.75, np.nan]]
+    np.testing.assert_array_equal(film.shares, [expected] * kept)
 
 
 def unpack(text):

@@ -25,25 +25,33 @@ every_task = pytest.mark.parametrize("case", CASES)
 
 @functools.cache
 def look(case):
-    """In a state that needs no solver: what agents perceive, the bodies in the slots, and the scene; one of two."""
-    both = jax.jit(jax.vmap(_look, (None, 0)))(TASK[case], jax.random.split(jax.random.key(2)))
-    return jax.tree.map(lambda leaf: leaf[1], both)
+    """In a random state: what agents perceive, the bodies in the slots, and the scene."""
+    task = TASK[case]
+
+    @jax.jit
+    def look(state):
+        return task.observe(state), task.slots(state), task.scene(state)
+
+    return look(random_state(task))
 
 
-def _look(task, key):
-    state = jax.eval_shape(task.reset, key)
-    if hasattr(state, "box_position"):
-        place, box, heading = jax.random.split(key, 3)
-        state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state)
-        state = state.replace(
-            position=jax.random.uniform(place, state.position.shape, minval=-0.5, maxval=0.5),
-            box_position=jax.random.uniform(box, state.box_position.shape, minval=-0.5, maxval=0.5),
-            box_heading=jax.random.uniform(heading, state.box_heading.shape),
-            box_present=jnp.arange(task.num_boxes) < (2 if task.active_boxes else task.num_boxes),
-        )
-    else:
-        state = task.reset(key)
-    return task.observe(state), task.slots(state), task.scene(state)
+def random_state(task):
+    """All that is drawn at random is anywhere; as few take part as the task allows."""
+    rng, low = np.random.default_rng(3), -0.5 if hasattr(task, "physics") else 0.0
+    state = jax.eval_shape(task.reset, jax.random.key(0))
+    values = {}
+    for name, leaf in vars(state).items():
+        kind = name.removeprefix("active_").removeprefix("box_")
+        if name.startswith("active_"):
+            bounds = getattr(task, name)
+            values[name] = jnp.int32(bounds[0] if bounds else getattr(task, f"num_{kind}"))
+        elif kind == "present":
+            values[name] = jnp.arange(leaf.shape[0]) < (task.active_boxes or leaf.shape)[0]
+        elif "position" in name:
+            values[name] = jnp.asarray(rng.uniform(low, low + task.side, leaf.shape), jnp.float32)
+        else:
+            values[name] = jnp.asarray(rng.uniform(0, 3, leaf.shape), leaf.dtype)
+    return state.replace(**values)
 
 
 def bodies(picture):
@@ -114,13 +122,7 @@ def test_clusters_have_groups_and_corners():
 
 
 def test_caught_evaders_are_marked():
-    task, key = TASK["pursuit"], jax.random.key(0)
-
-    @jax.jit
-    def is_caught(evader_position):
-        state = task.reset(key).replace(position=jnp.full((4, 2), 10.0), evader_position=evader_position)
-        return task.scene(state).is_caught
-
-    np.testing.assert_array_equal(
-        is_caught(jnp.array([[10.5, 10.0], [60.0, 60.0], [11.5, 10.0]])), [True, False, False]
-    )
+    task = TASK["pursuit"]
+    place = jnp.array([[10.5, 10.0], [60.0, 60.0], [11.5, 10.0]])
+    state = random_state(task).replace(position=jnp.full((4, 2), 10.0), evader_position=place)
+    np.testing.assert_array_equal(jax.jit(task.scene)(state).is_caught, [True, False, False])
