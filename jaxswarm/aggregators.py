@@ -4,6 +4,9 @@ An aggregator is a linen module that is called with a list of messages and their
 each receiver. Most are commutative monoids (see `sets`), which is why they can also be computed without ever holding
 all messages at once; `Attentive` and `Concat` need the whole group and have `pool` instead.
 
+Each tells by `weights` which share each entity has in the vector of its group, for those who look at a trained policy:
+shares of present entities sum to 1, absent ones have exactly 0.
+
 A message has `num_parts` parts of equal length. `num_encoders` says what makes them: one encoder all parts, as many
 encoders one part each, or, if 0, the message is the features of an entity as they are.
 """
@@ -17,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from numpy.polynomial import Chebyshev, Polynomial
 
 from jaxswarm import sets
@@ -45,6 +48,15 @@ def _softplus_precision_jvp(primals: tuple, tangents: tuple) -> tuple:
     return precision, -precision * (precision * sigmoid) * dx
 
 
+def _shares(
+    importance: Shaped[Array, "receivers slots features"], mask: Bool[Array, "receivers slots"]
+) -> Float[Array, "receivers slots"]:
+    """Importance over its sum over the entities that are present, mean over the features."""
+    importance = jnp.where(mask[..., None], importance, 0).astype(jnp.float32)
+    total = importance.sum(1, keepdims=True)
+    return (importance / jnp.where(total > 0, total, 1.0)).mean(-1)
+
+
 PRECISION = {"softplus": softplus_precision, "exp": lambda x: jnp.exp(-x)}  # of what a rectifier makes of a number
 
 
@@ -66,6 +78,10 @@ class Mean(nn.Module):
         total, count = summary
         return total / jnp.maximum(count, 1.0)
 
+    def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
+        """1 / n each."""
+        return _shares(view.mask[..., None], view.mask)
+
 
 class Max(nn.Module):
     """Largest value of each feature; the vector of an empty group is 0."""
@@ -83,6 +99,11 @@ class Max(nn.Module):
     def lower(self, summary: Array) -> Float[Array, "receivers features"]:
         """The maximum, if there is one."""
         return jnp.where(summary > sets.LOWEST, summary, 0.0)
+
+    def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
+        """Share of the features in which an entity has the largest value; those that are equal share one."""
+        x = jnp.where(view.mask[..., None], view.messages, sets.LOWEST)
+        return _shares(x == x.max(1, keepdims=True, initial=sets.LOWEST), view.mask)
 
 
 class Softmax(nn.Module):
@@ -105,6 +126,11 @@ class Softmax(nn.Module):
         """Numerator over denominator."""
         _, (weighted, weight) = summary
         return weighted / jnp.where(weight > 0, weight, 1.0)
+
+    def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
+        """exp(x_n) / sum_n exp(x_n), mean over the features."""
+        x = jnp.where(view.mask[..., None], view.messages, sets.LOWEST)
+        return _shares(jnp.exp(x - x.max(1, keepdims=True, initial=sets.LOWEST)), view.mask)
 
 
 class Bayesian(nn.Module):
@@ -164,6 +190,11 @@ class Bayesian(nn.Module):
         variance = jnp.where(precision > 0, 1.0 / jnp.where(precision > 0, precision, 1.0), 0.0)
         return jnp.concatenate([weighted * variance, variance], -1) if self.output_variance else weighted * variance
 
+    def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
+        """(1 / s_n) / sum_n (1 / s_n), mean over the features; what the prior adds is left out."""
+        raw_variance = jnp.split(view.messages, 2, -1)[1]
+        return _shares(PRECISION[self.rectifier](raw_variance), view.mask)
+
     def _prior(self, name: str, kind: str, num_features: int) -> Array:
         if kind == "fixed":
             return jnp.ones(1)
@@ -197,9 +228,20 @@ class Attentive(nn.Module):
 
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
 
-    @nn.compact
     def pool(self, view: DenseView) -> Float[Array, "receivers features"]:
-        """As y is linear in the values, only one weighted mean of the x_j is taken to values, by receiver and head."""
+        """The vector z of each receiver."""
+        return self._attend(view)[0]
+
+    def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
+        """sum_i w_i p_hij, mean over the heads; without what entity j adds by the residual."""
+        return jnp.stack(self._attend(view)[1]).mean(0)
+
+    @nn.compact
+    def _attend(self, view: DenseView) -> tuple[Float[Array, "receivers features"], list[Array]]:
+        """The z, and sum_i w_i p_hij of each head.
+
+        As y is linear in the values, only one weighted mean of the x_j is taken to values, by receiver and head.
+        """
         x, size = view.messages, view.messages.shape[-1]
         if size % self.num_heads:
             raise ValueError(f"num_heads = {self.num_heads} is not possible; accepted: divisors of {size} features")
@@ -221,7 +263,7 @@ class Attentive(nn.Module):
         z = jnp.concatenate(values, -1) @ W_o + b_o[None]
         if self.residual:
             z = z + mean
-        return jnp.where(view.mask.any(-1, keepdims=True), z, 0.0)
+        return jnp.where(view.mask.any(-1, keepdims=True), z, 0.0), weights
 
     def _query_weights(
         self, view: DenseView, attention: list, value_output: Float[Array, "heads size size"]
@@ -276,11 +318,19 @@ class Concat(nn.Module):
 
     def pool(self, view: DenseView) -> Float[Array, "receivers all_features"]:
         """Sorts by distance, absent entities last."""
-        keys = jnp.where(view.mask[..., None], jax.lax.stop_gradient(view.messages), jnp.inf)
-        order = jnp.lexsort(jnp.moveaxis(keys, -1, 0)[::-1])[:, : self.max_entities, None]
+        order = self._order(view)[..., None]
         nearest = jnp.take_along_axis(jnp.where(view.mask[..., None], view.messages, 0.0), order, axis=1)
         nearest = jnp.pad(nearest, ((0, 0), (0, self.max_entities - nearest.shape[1]), (0, 0)))
         return nearest.reshape(nearest.shape[0], self.max_entities * nearest.shape[2])
+
+    def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
+        """Equal for those that there is room for, 0 for the others."""
+        is_taken = jax.nn.one_hot(self._order(view), view.mask.shape[1], dtype=bool).any(1)
+        return _shares((is_taken & view.mask)[..., None], view.mask)
+
+    def _order(self, view: DenseView) -> Int[Array, "receivers nearest"]:
+        keys = jnp.where(view.mask[..., None], jax.lax.stop_gradient(view.messages), jnp.inf)
+        return jnp.lexsort(jnp.moveaxis(keys, -1, 0)[::-1])[:, : self.max_entities]
 
 
 class Histogram(nn.Module):
@@ -319,6 +369,7 @@ class Histogram(nn.Module):
         return _outer(in_ring, in_sector, jnp.logical_and).astype(jnp.float32), ones.astype(jnp.float32)
 
     lower = Mean.lower
+    weights = Mean.weights
 
 
 class RadialBasis(nn.Module):
@@ -359,6 +410,7 @@ class RadialBasis(nn.Module):
         return _outer(near, ahead, jnp.multiply), jnp.ones((features.shape[0], 1))
 
     lower = Mean.lower
+    weights = Mean.weights
 
 
 def _distance_and_bearing(features: Float[Array, "n dim"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 2"]]:

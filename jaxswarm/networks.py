@@ -74,9 +74,18 @@ class Tower(nn.Module):
     aggregator: Any
     latent_space: str
 
-    @nn.compact
     def __call__(self, own: Float[Array, "n own_dim"], groups: dict[str, Entities]) -> Float[Array, "n latent"]:
         """Latent vector of each receiver."""
+        return self._compute(own, groups)
+
+    def weights(
+        self, own: Float[Array, "n own_dim"], groups: dict[str, Entities]
+    ) -> dict[str, Float[Array, "n slots"]]:
+        """The share that each entity has in the aggregate of its group."""
+        return self._compute(own, groups, "weights")
+
+    @nn.compact
+    def _compute(self, own: Array, groups: dict[str, Entities], wanted: Literal["latent", "weights"] = "latent") -> Any:
         names = sorted(groups)
         if self.latent_space == "shared" and self.aggregator.num_encoders == 0 and len(names) > 1:
             raise ValueError(
@@ -85,13 +94,19 @@ class Tower(nn.Module):
             )
         encoders = self._encoders(names)
         pools = {"groups": names} if self.latent_space == "shared" else {name: [name] for name in names}
-        x = [own]
-        for pool, members in pools.items():
-            aggregator = self.aggregator.copy(name=f"{pool}_aggregator")
+        x, weights = [own], {}
+        for name, members in pools.items():
+            aggregator = self.aggregator.copy(name=f"{name}_aggregator")
             inputs = tuple(groups[m] for m in members)
             is_encoded = self.aggregator.num_encoders > 0
             width = (*self.encoder, *self.shared_encoder)[-1] if is_encoded else inputs[0].features.shape[-1]
-            x.append(sets.Pool(aggregator, tuple(encoders[m] for m in members), width)(inputs, own))
+            pool = sets.Pool(aggregator, tuple(encoders[m] for m in members), width)
+            if wanted == "weights":
+                weights |= dict(zip(members, pool.weights(inputs, own), strict=True))
+            else:
+                x.append(pool(inputs, own))
+        if wanted == "weights":
+            return weights
         latent = jnp.concatenate(x, -1)
         for width in self.decoder:
             latent = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=_HIDDEN_INIT)(latent))
@@ -153,6 +168,14 @@ class ActorCritic(nn.Module):
     def value(self, obs: Observation) -> Float[Array, "*receivers"]:
         """Value estimate of every receiver."""
         return self.value_head(self.critic(*_flat(obs))).reshape(obs.own.shape[:-1])
+
+    def weights(self, obs: Observation) -> dict[str, Float[Array, "*receivers slots"]]:
+        """The share that each entity has in what the actor aggregates; see the `weights` of the aggregator.
+
+        Present entities of one group sum to 1, with `latent_space="shared"` those of all groups; absent ones have 0.
+        """
+        weights = self.actor.weights(*_flat(obs))
+        return {name: x.reshape(*obs.own.shape[:-1], x.shape[-1]) for name, x in weights.items()}
 
 
 def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:

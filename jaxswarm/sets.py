@@ -222,7 +222,7 @@ class Pool(nn.Module):
         streams = isinstance(self.aggregator, Monoid) and self.aggregator.num_encoders > 0
         layout = self.layout or (_FASTEST[self.aggregator.reduction] if streams else "dense")
         num_receivers = groups[0].mask.shape[0]
-        groups = tuple(Entities(jnp.where(x.mask[..., None], x.features, 0.0), x.mask) for x in groups)
+        groups = _cleared(groups)
         num_pieces = max(-(-num_receivers // self._piece_size(layout, groups)), 1)
         if num_pieces == 1:
             return getattr(self, layout)(groups, own)
@@ -234,6 +234,13 @@ class Pool(nn.Module):
         scan = nn.scan(body, variable_broadcast="params", split_rngs={"params": False})
         out = scan(self, None, jax.tree.map(lambda x: _split(x, num_pieces), (groups, own)))[1]
         return out.reshape(-1, out.shape[-1])[:num_receivers]
+
+    def weights(
+        self, groups: tuple[Entities, ...], own: Float[Array, "receivers own_dim"] | None = None
+    ) -> tuple[Float[Array, "receivers slots"], ...]:
+        """The share of each entity in the vector of its receiver; over all groups these sum to 1, or 0 without any."""
+        weights = self.aggregator.weights(self._encode(_cleared(groups), own))
+        return tuple(jnp.split(weights, np.cumsum([group.mask.shape[1] for group in groups])[:-1], 1))
 
     def streaming(self, groups: tuple[Entities, ...], own: Array | None) -> Float[Array, "receivers out"]:
         """One slot after the other; the backward pass encodes each again instead of storing it."""
@@ -284,6 +291,11 @@ class Pool(nn.Module):
             return max(groups[0].mask.shape[0], 1)
         num_slots = 1 if layout == "streaming" else sum(group.mask.shape[1] for group in groups)
         return max(_PIECE[layout] // max(num_slots * self.width * self.aggregator.num_parts, 1), 1)
+
+
+def _cleared(groups: tuple[Entities, ...]) -> tuple[Entities, ...]:
+    """With the features of absent entities 0."""
+    return tuple(Entities(jnp.where(x.mask[..., None], x.features, 0.0), x.mask) for x in groups)
 
 
 def _split(x: Array, num_pieces: int) -> Array:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxswarm import AGGREGATORS
 from jaxswarm.aggregators import softplus_precision
-from jaxswarm.sets import Segments, segments_of
+from jaxswarm.sets import DenseView, Segments, segments_of
 
 WIDTH, SLOTS, RECEIVERS, OWN = 4, 5, 3, 2
 SMALL = {
@@ -294,3 +294,68 @@ def test_precision_of_softplus_and_its_gradient_over_the_whole_range():
     np.testing.assert_allclose(softplus_precision(x), 1 / variance, rtol=1e-5)
     gradient = jax.vmap(jax.grad(softplus_precision))(x)
     np.testing.assert_allclose(gradient, -1 / (1 + np.exp(-np.float64(x))) / variance**2, rtol=1e-5, atol=1e-37)
+
+
+MASK = np.array([[True, False, True, True, False], [False] * SLOTS, [False, False, False, True, False]])
+
+
+def shares(name):
+    """What a model gives for random messages, and these messages; distances are positive."""
+    messages = np.random.default_rng(8).normal(size=(RECEIVERS, SLOTS, LENGTH[name])).astype(np.float32)
+    messages[..., 0] = np.abs(messages[..., 0])
+    view = DenseView(jnp.asarray(messages), jnp.asarray(MASK), jnp.asarray(OWN_FEATURES))
+    weights = jax.jit(lambda params, view: MODELS[name].apply(params, view, method="weights"))(params_of(name), view)
+    return np.asarray(weights), messages
+
+
+@every_aggregator
+def test_shares_sum_to_one_over_present_entities(name):
+    weights, _ = shares(name)
+    assert (weights[~MASK] == 0).all()
+    assert (weights >= 0).all()
+    np.testing.assert_allclose(weights.sum(1), [1, 0, 1], rtol=1e-5)
+
+
+def _softmax(x):
+    return np.exp(x) / np.exp(x).sum(0)
+
+
+def _attention(x, name="attentive"):
+    """Mean over heads and queries, with queries, keys and values one after the other in the kernel."""
+    kernel, bias = (np.asarray(params_of(name)["params"][part]) for part in ("in_kernel", "in_bias"))
+    q, k, _ = (part.reshape(len(x), 2, -1) for part in np.split(x @ kernel + bias, 3, -1))
+    score = np.einsum("ihd,jhd->jhi", q, k) / np.sqrt(q.shape[-1])
+    return _softmax(score).mean((1, 2))
+
+
+SHARES = {
+    "mean": lambda x: np.full(len(x), 1 / len(x)),
+    "max": lambda x: (x == x.max(0)).mean(1),
+    "softmax": lambda x: _softmax(x).mean(1),
+    "bayesian": lambda x: (1 / np.log1p(np.exp(x[:, 4:])) / (1 / np.log1p(np.exp(x[:, 4:]))).sum(0)).mean(1),
+    "bayesian, exp, no prior": lambda x: _softmax(-x[:, 4:]).mean(1),
+    "attentive": _attention,
+    "histogram": lambda x: np.full(len(x), 1 / len(x)),
+    "rbf": lambda x: np.full(len(x), 1 / len(x)),
+}
+
+
+@pytest.mark.parametrize("name", SHARES)
+def test_shares_are_those_of_the_formula(name):
+    weights, messages = shares(name)
+    for receiver in (0, 2):
+        present = MASK[receiver]
+        np.testing.assert_allclose(weights[receiver, present], SHARES[name](messages[receiver, present]), rtol=1e-4)
+
+
+def test_entities_that_concat_has_no_room_for_have_no_share():
+    weights, messages = shares("concat")
+    np.testing.assert_allclose(weights[0, MASK[0]], 1 / 3, rtol=1e-6)
+    view = DenseView(jnp.asarray(messages), jnp.asarray(MASK))
+    (nearest,) = np.flatnonzero(AGGREGATORS["concat"](max_entities=1).weights(view)[0])
+    assert nearest == np.where(MASK[0], messages[0, :, 0], np.inf).argmin()
+
+
+def test_entities_that_are_equal_share_a_maximum():
+    view = DenseView(jnp.ones((1, 2, 3)), jnp.ones((1, 2), bool))
+    np.testing.assert_allclose(AGGREGATORS["max"]().weights(view), [[0.5, 0.5]])

@@ -45,7 +45,7 @@ def test_training_ends_with_its_files_and_the_next_command(finished, tmp_path, m
     out = capsys.readouterr().out
     (run_dir,) = (tmp_path / "runs").iterdir()
     assert run_dir.name.startswith("rendezvous-mean-ppo-")
-    names = {"config.yaml", "manifest.json", "metrics.csv", "checkpoints", "curve.png"}
+    names = {"config.yaml", "manifest.json", "metrics.csv", "checkpoints", "curve.png", "replay.html"}
     assert {path.name for path in run_dir.iterdir()} == names
     assert all(f"{run_dir.relative_to(tmp_path)}/{name}" in out for name in names)
     assert out.splitlines()[-1].startswith("next: jaxswarm-eval runs/rendezvous-mean-ppo-")

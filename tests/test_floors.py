@@ -11,7 +11,7 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
-    {"types"},
+    {"types", "scene"},
     {"geometry", "contacts", "sets", "distributions"},
     {"dynamics", "neighbors", "shapes", "aggregators"},
     {"rigid2d", "tasks.swarm", "tasks.evasion", "networks"},
@@ -26,12 +26,13 @@ FLOORS = [
     {"config", "checkpoint", "curves", "ensemble"},
     {"plots"},
     {"reporting"},
-    {"runs", "loggers"},
-    {"recording"},
-    {"fit"},
+    {"runs", "loggers", "render.film"},
+    {"recording", "render.page", "render.pictures"},
+    {"fit", "render"},
     {"sweep", "search"},
     {"cli.words"},
-    {"cli.train", "cli.evaluate", "cli.plot"},
+    {"cli.policies"},
+    {"cli.train", "cli.evaluate", "cli.plot", "cli.render"},
     {"cli.sweep"},
     {"cli"},
 ]

@@ -223,3 +223,31 @@ def test_a_standard_deviation_of_the_state_starts_near_1_and_differs_between_sta
     assert (
         np.asarray(shared.apply(jax.jit(shared.init)(jax.random.key(0), obs), obs, method="policy").stddev()) == 1
     ).all()
+
+
+@pytest.mark.parametrize("latent_space", ["separate", "shared"])
+def test_shares_of_entities_by_group(latent_space):
+    """Those of one aggregate sum to 1; of a mean, all that are present are equal."""
+    obs = pursuit_like(2)
+    neighbors, evaders = obs.groups["neighbors"], obs.groups["evaders"]
+    obs = obs.replace(
+        groups={"neighbors": neighbors, "evaders": evaders.replace(mask=evaders.mask.at[1, 0].set(False))}
+    )
+    model = ActorCritic((4,), (4,), latent_space=latent_space)
+    tree = jax.jit(model.init)(jax.random.key(0), obs)
+    shares = jax.jit(partial(model.apply, method="weights"))(tree, jax.tree.map(lambda x: x[:, None], obs))
+    near, far = ([1 / 3] * 3, [0, 0.5, 0.5]) if latent_space == "separate" else ([0.2] * 3, [0, 0.2, 0.2])
+    np.testing.assert_allclose(shares["neighbors"][1, 0], near, rtol=1e-6)
+    np.testing.assert_allclose(shares["evaders"][1, 0], far, rtol=1e-6)
+
+
+def test_shares_are_those_of_the_actor():
+    obs = pursuit_like(2)
+    model = ActorCritic((4,), (4,), aggregator=AGGREGATORS["softmax"]())
+    tree = jax.jit(model.init)(jax.random.key(0), obs)
+    layer = tree["params"]["actor"]["evaders_encoder"]
+    x = np.asarray(obs.groups["evaders"].features) @ np.asarray(layer["kernel"]) + np.asarray(layer["bias"])
+    e = np.exp(np.where(x > 0, x, 0.01 * x))
+    expected = (e / e.sum(1, keepdims=True)).mean(-1)
+    shares = jax.jit(partial(model.apply, method="weights"))(tree, obs)
+    np.testing.assert_allclose(shares["evaders"], expected, rtol=1e-5)

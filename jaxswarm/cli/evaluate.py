@@ -2,14 +2,14 @@
 
 import functools
 import json
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.words import load, only, program, resume_command, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
+from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
@@ -37,19 +37,13 @@ def main(arguments: Sequence[str]) -> int:
     )
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
-    which = options.get("checkpoint", "best")
-    if which not in ("best", "last"):
-        raise ConfigError(f"checkpoint = {which!r} is not possible; accepted: best, last")
+    which = which_checkpoint(options)
     config = load(Path(paths[0]))
     episodes = whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
     seed = whole("seed", options.get("seed", 0), 0)
     changes = configs.combinations(words)
     only(changes[0], lambda key: key.startswith("task."), "task.<field>=value")
-    trained = configs.run_settings(config).seeds
-    train_seeds = [whole("train_seed", options["train_seed"], 0)] if "train_seed" in options else list(trained)
-    if train_seeds[0] not in trained:
-        raise ConfigError(f"train_seed = {train_seeds[0]} is not possible; accepted: {trained[0]} to {trained[-1]}")
-    asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": train_seeds}
+    asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": which_seeds(options, config)}
     result = _evaluate(Path(paths[0]), config, changes, asked)
     return _report(Path(paths[0]), result) if result else 1
 
@@ -58,48 +52,36 @@ def _evaluate(
     run_dir: Path, config: Config, changes: Sequence[Sequence[tuple[str, Any]]], asked: dict[str, Any]
 ) -> dict[str, Any] | None:
     """Plays the episodes of every changed task; `None` after saying that no checkpoint can be restored."""
-    experiment, trained = configs.build(config), configs.run_settings(config).seeds
     tasks = [configs.override(config, pairs)["task"] for pairs in changes]
     built = [configs.build_part("task", {"task": task}) for task in tasks]
     use_compile_cache()
+    policies = load_policies(run_dir, config, asked["which"], asked["train_seeds"])
+    if policies is None:
+        return None
+    for task in built:
+        require_fit(policies, task)
     import jax  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
     from jaxswarm import rollout  # noqa: PLC0415
-    from jaxswarm.checkpoint import CheckpointError, restore  # noqa: PLC0415
-    from jaxswarm.fit import abstract_state  # noqa: PLC0415
 
-    warn = functools.partial(print, file=sys.stderr)
-    try:
-        restored = restore(run_dir / "checkpoints", abstract_state(experiment, len(trained)), asked["which"], warn)
-    except CheckpointError as error:
-        warn(f"error: {error}")
-        return None
-    if restored is None:
-        raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: {resume_command(run_dir)}")
-    params, key = restored.train_state.learner.params, jax.random.key(asked["seed"])
-    wanted = np.array([trained.index(seed) for seed in asked["train_seeds"]])
-    params = jax.tree.map(lambda x: x[wanted], params)
-    for task in built:
-        needed = jax.eval_shape(lambda task=task: experiment.network.init(key, task.observe(task.reset(key))))
-        if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape[1:], params):
-            raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
+    key = jax.random.key(asked["seed"])
 
     @jax.jit
     def play(params: Any, task: Any) -> dict[str, Any]:
         def episodes(params: Any) -> dict[str, Any]:
-            policy: Any = functools.partial(experiment.network.apply, params, method="policy")
+            policy: Any = functools.partial(policies.network.apply, params, method="policy")
             return rollout.evaluate(key, task, policy, asked["episodes"])
 
         return jax.lax.map(episodes, params)
 
     results = []
     for pairs, task, with_leaves in zip(changes, tasks, built, strict=True):
-        of_seeds = {name: np.float64(x) for name, x in play(params, with_leaves).items()}
+        of_seeds = {name: np.float64(x) for name, x in play(policies.params, with_leaves).items()}
         means = {name: float(x.mean()) for name, x in of_seeds.items()}
         each = {name: x.tolist() for name, x in of_seeds.items()}
         results.append({"changed": dict(pairs), "task": task, "metrics": means, "of_each_seed": each})
-    found = {"update": restored.update, "score_in_training": restored.score, "device": jax.devices()[0].device_kind}
+    found = {"update": policies.update, "score_in_training": policies.score, "device": jax.devices()[0].device_kind}
     return asked | found | {"results": results}
 
 

@@ -27,7 +27,7 @@ HELP = """\
 jaxswarm-train [group=choice | key=value] ... [run_dir=PATH]
 jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
 
-Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, checkpoints.
+Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, replay.html, checkpoints.
 Ctrl-C or SIGTERM ends it after a checkpoint; resume=PATH continues it exactly where its last checkpoint stands.
 Several processes, on one machine or more, train together if each runs the same command with JAX_COORDINATOR_ADDRESS,
 JAX_NUM_PROCESSES and JAX_PROCESS_ID set; the first one writes.
@@ -115,6 +115,9 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     if update < num_updates:
         print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
         return 0
+    from jaxswarm import render  # noqa: PLC0415
+
+    render.write_replay(run_dir, experiment, render.of_seed(train_state.learner.params, 0), update=update)
     if rows:
         first, last = (_return_at(rows, rows[index]["update"]) for index in (0, -1))
         print(f"done: {update} updates, return {last} (untrained {first})")
@@ -169,6 +172,7 @@ def _summary(config: Config, experiment: Any, num_updates: int, run_dir: Path) -
 def _files(run_dir: Path) -> str:
     about = {
         "curve.png": "learning curve",
+        "replay.html": "an episode of the last policy: open it in a browser",
         "metrics.csv": "a row per evaluation",
         "checkpoints": "the latest and the best state",
         "config.yaml": "what was asked for",

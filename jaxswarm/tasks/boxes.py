@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm import rigid2d
-from jaxswarm.contacts import BOX_SIDE, MAX_SPEED, MAX_TURN_RATE
+from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, MAX_SPEED, MAX_TURN_RATE
 from jaxswarm.geometry import bearing, direction, norm, unit
-from jaxswarm.tasks.swarm import NumberRange, draw_number, require_range
+from jaxswarm.scene import Bodies, Goals, Scene
+from jaxswarm.tasks.swarm import NumberRange, after, draw_number, require_range
 from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_whole, pytree, require, static
 
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # over the side; where clusters belong, in their order
@@ -141,6 +142,20 @@ class Arena:
         }
         return Observation(own=window(view.own, agent, 1)[0], groups=groups)
 
+    def slots(self) -> dict[str, Int[Array, "agents slots"]]:
+        """Which body of the scene is in which slot of `perceive`, for all robots."""
+        robots = jnp.arange(self.num_agents)
+        boxes = jnp.broadcast_to(self.num_agents + jnp.arange(self.num_boxes), (self.num_agents, self.num_boxes))
+        return {"neighbors": jax.vmap(after, (0, None))(robots, self.num_agents), "boxes": boxes}
+
+    def scene(self, state: State) -> Scene:
+        """Discs and squares between walls; boxes are grouped by cluster."""
+        robots = Bodies(state.position, jnp.ones(self.num_agents, bool), state.heading, size=DISC_RADIUS)
+        cluster = jnp.array(self.cluster)
+        boxes = Bodies(state.box_position, state.box_present, state.box_heading, cluster, size=BOX_SIDE)
+        corner = jnp.full(2, self.side / 2)
+        return Scene(-corner, corner, False, robots, boxes=boxes)
+
 
 def _turn(ahead: Float[Array, "*#n 2"], toward: Float[Array, "*#n 2"]) -> Float[Array, "*n 2"]:
     """[sin, cos] of the counter-clockwise angle from `ahead` to `toward`."""
@@ -226,6 +241,14 @@ class Assembly:
         """What each robot perceives."""
         return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
 
+    def slots(self, state: State) -> dict[str, Int[Array, "agents slots"]]:
+        """Which body of the scene is in which slot of `observe`."""
+        return self.arena.slots()
+
+    def scene(self, state: State) -> Scene:
+        """See `Arena.scene`."""
+        return self.arena.scene(state)
+
 
 @pytree
 class Clustering:
@@ -309,16 +332,35 @@ class Clustering:
             identity = jax.nn.one_hot(jnp.array(self.cluster), self.num_clusters)
             boxes = Entities(jnp.concatenate([boxes.features, identity], -1), boxes.mask)
             return Observation(obs.own, obs.groups | {"boxes": boxes})
-        sizes = np.bincount(self.cluster)
-        parts = [slice(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
-        groups = {
-            f"boxes_{index}": Entities(boxes.features[part], boxes.mask[part]) for index, part in enumerate(parts)
-        }
+        groups = {name: Entities(boxes.features[part], boxes.mask[part]) for name, part in self._parts.items()}
         return Observation(obs.own, {"neighbors": obs.groups["neighbors"]} | groups)
+
+    @property
+    def _parts(self) -> dict[str, slice]:
+        """The boxes of each group."""
+        sizes = np.bincount(self.cluster)
+        ends = enumerate(zip(np.cumsum(sizes), sizes, strict=True))
+        return {f"boxes_{index}": slice(end - size, end) for index, (end, size) in ends}
 
     def observe(self, state: State) -> Observation:
         """What each robot perceives."""
         return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
+
+    def slots(self, state: State) -> dict[str, Int[Array, "agents slots"]]:
+        """Which body of the scene is in which slot of `observe`."""
+        slots = self.arena.slots()
+        if self.cluster_identity == "one-hot":
+            return slots
+        groups = {name: slots["boxes"][:, part] for name, part in self._parts.items()}
+        return {"neighbors": slots["neighbors"]} | groups
+
+    def scene(self, state: State) -> Scene:
+        """See `Arena.scene`; with the reward `corners` these are goals."""
+        scene = self.arena.scene(state)
+        if self.reward != "corners":
+            return scene
+        corners = jnp.array(CORNERS[: self.num_clusters]) * self.side
+        return scene._replace(goals=Goals(corners, jnp.arange(self.num_clusters)))
 
 
 def _within(task: Clustering, present: Bool[Array, "boxes"]) -> Bool[Array, "clusters boxes boxes"]:

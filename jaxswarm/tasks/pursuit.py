@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxswarm.dynamics import Velocity
 from jaxswarm.geometry import Space, bearing, direction, norm, unit
 from jaxswarm.neighbors import Neighborhood, neighborhood
+from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.evasion import flight
 from jaxswarm.tasks.swarm import NumberRange
@@ -216,6 +217,19 @@ class Pursuit:
     def observe(self, state: State) -> Observation:
         """What each agent perceives; see `perceive`."""
         return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
+
+    def slots(self, state: State) -> dict[str, Int[Array, "agents slots"]]:
+        """Which body of the scene is in which slot of `observe`; -1: none."""
+        evaders = jnp.broadcast_to(self.num_agents + jnp.arange(self.num_evaders), (self.num_agents, self.num_evaders))
+        return {"neighbors": swarm.slots(self.view(state)), "evaders": evaders}
+
+    def scene(self, state: State) -> Scene:
+        """Points in a square; evaders are marked where they are caught, before they start anew."""
+        is_agent = swarm.is_present(state.active_agents, self.num_agents)
+        is_evader = swarm.is_present(state.active_evaders, self.num_evaders)
+        agents = Bodies(state.position, is_agent, state.heading, seen_within=self.visibility_radius)
+        evaders = Bodies(state.evader_position, is_evader, seen_within=self.evader_visibility_radius)
+        return Scene(jnp.zeros(2), jnp.full(2, self.side), self.torus, agents, evaders, is_caught=self.is_caught(state))
 
 
 def _entities(distance: Array, bearings: Array, radius: Array | float, is_present: Array) -> Entities:

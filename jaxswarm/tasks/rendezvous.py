@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from jaxswarm.dynamics import DYNAMICS, Acceleration, Velocity
 from jaxswarm.geometry import Space, direction
 from jaxswarm.neighbors import Neighborhood, neighborhood
+from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.swarm import NumberRange, View
 from jaxswarm.types import Entities, Key, Observation, Step, pytree, require, static
@@ -161,3 +162,13 @@ class Rendezvous:
     def observe(self, state: State) -> Observation:
         """What each agent perceives; see `perceive`."""
         return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
+
+    def slots(self, state: State) -> dict[str, Int[Array, "agents slots"]]:
+        """Which body of the scene is in which slot of `observe`; -1: none."""
+        return {"neighbors": swarm.slots(self.view(state))}
+
+    def scene(self, state: State) -> Scene:
+        """Points in a square."""
+        is_present = swarm.is_present(state.active_agents, self.num_agents)
+        agents = Bodies(state.position, is_present, state.heading, seen_within=self.visibility_radius)
+        return Scene(jnp.zeros(2), jnp.full(2, self.side), self.torus, agents)

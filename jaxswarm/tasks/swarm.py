@@ -72,6 +72,22 @@ def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_ne
     return {"unseen_neighbors": jnp.where(present, missed, 0).sum() / present.sum()}
 
 
+def after(agent: Int[Array, ""], num_agents: int) -> Int[Array, " others"]:
+    """All other agents in cyclic order, from the one after it on."""
+    index = agent + jnp.arange(1, num_agents)
+    return jnp.where(index < num_agents, index, index - num_agents)
+
+
+def others(view: View, agent: Int[Array, ""]) -> Int[Array, " others"]:
+    """Those whom `pick` gives, in its order; -1 where a list of the nearest ends early."""
+    return after(agent, view.agents.position.shape[0]) if view.nearest is None else view.nearest[agent]
+
+
+def slots(view: View) -> Int[Array, "agents others"]:
+    """`others` of every agent."""
+    return jax.vmap(others, (None, 0))(view, jnp.arange(view.agents.position.shape[0]))
+
+
 def pick(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " others"]]:
     """The agent, leaves [1, ...]; those it may see, leaves [others, ...]; and whether they take part.
 
@@ -84,12 +100,10 @@ def pick(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " oth
         twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), view.agents)
         return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, size), twice)
 
+    index = others(view, agent)
     if view.nearest is not None:
-        nearest = view.nearest[agent]
-        me, them = (jax.tree.map(lambda leaf, i=i: leaf[i], view.agents) for i in (agent[None], nearest))
-        return me, them, nearest >= 0
-    index = agent + jnp.arange(1, num_agents)
-    index = jnp.where(index < num_agents, index, index - num_agents)
+        me, them = (jax.tree.map(lambda leaf, i=i: leaf[i], view.agents) for i in (agent[None], index))
+        return me, them, index >= 0
     return window(agent, 1), window(agent + 1, num_agents - 1), index < view.active_agents
 
 

@@ -1,0 +1,79 @@
+"""The program `jaxswarm-render`."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxswarm import config as configs
+from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
+from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.config import ConfigError
+
+HELP = """\
+jaxswarm-render PATH [PATH ...] [out=FILE] [checkpoint=best|last] [seed=N] [train_seed=N] [task.key=value] ...
+
+Plays an episode of each run's policy, side by side, and writes it in the format of the suffix of `out`. `seed` is that
+of the episode; of a run with several seeds it is the policy of the first, or of train_seed.
+  .html  one page that needs no network: play, scrub, click an agent to see what it looks at (default: replay.html)
+  .png   a strip of frames=N pictures (6), evenly spaced up to step until=N (the end)
+  .gif   a moving picture of frames=N pictures (150), up to step until=N
+  .mp4   every step, up to step until=N; needs ffmpeg
+
+examples
+  jaxswarm-render runs/thesis
+  jaxswarm-render runs/mean runs/bayesian seed=3 out=compared.html
+  jaxswarm-render runs/thesis task.num_agents=200 out=strip.png frames=6 until=200
+"""
+OPTIONS = ("out", "checkpoint", "seed", "train_seed", "frames", "until")
+
+
+@program
+def main(arguments: Sequence[str]) -> int:
+    """Plays policies and writes what was to be seen; returns the exit code."""
+    if wants_help(arguments) or not arguments:
+        print(HELP)
+        return 0 if arguments else 2
+    paths = [Path(word) for word in arguments if "=" not in word]
+    options, words = split([word for word in arguments if "=" in word], OPTIONS)
+    if not paths:
+        raise ConfigError("give at least one run folder: jaxswarm-render PATH [key=value ...]")
+    seed = whole("seed", options.get("seed", 0), 0)
+    sizes = {name: whole(name, options[name], 1) for name in ("frames", "until") if name in options}
+    pairs = configs.parse(words)
+    only(pairs, lambda key: key.startswith("task."), "task.<field>=value")
+    out = Path(options.get("out", paths[0] / "replay.html"))
+    use_compile_cache()
+    from jaxswarm import render  # noqa: PLC0415
+
+    try:
+        render.check(out, **sizes)
+        films = [_film(path, pairs, options, seed, len(paths)) for path in paths]
+        if None in films:
+            return 1
+        render.write(out, films, **sizes)
+    except (ValueError, render.RenderError) as error:
+        raise ConfigError(str(error)) from error
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}") from error
+    for film in films:
+        print(f"{film.title}: {film.num_frames - 1} steps, return {film.score[-1]:.2f}")
+    print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _film(
+    run_dir: Path, pairs: Sequence[tuple[str, Any]], options: Mapping[str, str], seed: int, num_films: int
+) -> Any:
+    """An episode of the policy of a run; `None` if it cannot be restored. All films together stay below the limit."""
+    config = load(run_dir)
+    task = configs.build_part("task", configs.override(config, pairs))
+    trained = which_seeds(options, config)[:1]
+    policies = load_policies(run_dir, config, which_checkpoint(options), trained)
+    if policies is None:
+        return None
+    require_fit(policies, task)
+    from jaxswarm import render  # noqa: PLC0415
+
+    title = f"{run_dir.name}, {render.describe(task)}, after update {policies.update}"
+    params, limit = render.of_seed(policies.params, 0), render.MAX_SHARES // num_films
+    return render.record(task, policies.network, params, seed=seed, title=title, max_shares=limit)

@@ -1,0 +1,246 @@
+"""Films are whole episodes with the shares of the network; pages and pictures hold all that was to be seen."""
+
+import base64
+import dataclasses
+import json
+import re
+import shutil
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from films import episode
+from PIL import Image
+
+from jaxswarm import config as configs
+from jaxswarm import render
+from jaxswarm.checkpoint import Checkpoints
+from jaxswarm.cli import render as program
+from jaxswarm.distributions import gaussian
+from jaxswarm.render import page
+from jaxswarm.render.film import MAX_SHARES
+from jaxswarm.scene import Bodies, Scene
+from jaxswarm.training import init
+from jaxswarm.types import Entities, Observation, Step, pytree, static
+
+TINY = [
+    *("task.num_agents=3", "task.episode_length=5", "num_worlds=2", "num_steps=4", "learner.batch_size=12"),
+    *("eval_worlds=1", "eval_every=3", "network.encoder=[4]", "network.decoder=[4]", "num_updates=1"),
+]
+
+
+@pytree
+class Clock:
+    time: jax.Array
+
+
+@pytree
+class Countdown:
+    """A task that is over after `length` steps; the reward is their number. Nobody sees the third of its agents."""
+
+    length: int = 4
+    num_agents: int = static(default=3)
+    episode_length: int = static(default=9)
+
+    def reset(self, key):
+        return Clock(jnp.zeros((), jnp.int32))
+
+    def step(self, key, state, action):
+        is_over = state.time + 1 >= self.length
+        return Clock(state.time + 1), Step(state.time + 1.0, is_over, is_over, {})
+
+    def observe(self, state):
+        mask = self.slots(state)["neighbors"] < 2
+        return Observation(jnp.zeros((3, 1)), {"neighbors": Entities(jnp.zeros((3, 2, 1)), mask)})
+
+    def slots(self, state):
+        return {"neighbors": jnp.array([[1, 2], [2, 0], [0, 1]])}
+
+    def scene(self, state):
+        agents = Bodies(jnp.full((3, 2), state.time), jnp.ones(3, bool))
+        return Scene(jnp.zeros(2), jnp.ones(2), False, agents)
+
+
+class Standing:
+    """A network that does nothing, and tells of weights."""
+
+    def apply(self, params, obs, method):
+        if method == "weights":
+            return {"neighbors": jnp.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]])}
+        return gaussian(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
+
+
+def test_a_film_ends_where_the_episode_ends():
+    film = render.record(Countdown(), Standing(), None, max_shares=1)
+    np.testing.assert_array_equal(film.score, [0, 1, 3, 6, 10])
+    np.testing.assert_array_equal(film.scenes.agents.position[:, 0, 0], [0, 1, 2, 3, 4])
+    assert film.shares is None  # two frames of them would be too large
+
+
+@pytest.mark.parametrize(("length", "kept"), [(100, 5), (4, 3)])
+def test_shares_are_kept_of_so_many_frames_and_by_the_number_of_the_body(length, kept):
+    film = render.record(Countdown(length), Standing(), None, max_shares=5 * 9)
+    assert film.num_frames == min(length, 9) + 1
+    assert film.shares_every == 2
+    expected = [[np.nan, 1, np.nan], [1, np.nan, np.nan], [0.25, 0.75, np.nan]]
+    np.testing.assert_array_equal(film.shares, [expected] * kept)
+
+
+def unpack(text):
+    about = json.loads(re.search(r'<script id="about"[^>]*>(.*?)</script>', text, re.S)[1])
+    data = re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1]
+    return about, zlib.decompress(base64.b64decode(data))
+
+
+@pytest.mark.parametrize("kinds", [{"num_evaders": 2}, {"num_boxes": 4}])
+def test_a_page_holds_what_the_film_shows(kinds):
+    film = episode(**kinds)
+    about, data = unpack(page.html([film, film]))
+    assert [x["title"] for x in about["films"]] == [film.title] * 2
+    told = about["films"][1]
+    arrays = {name: np.frombuffer(data[a:b], page.TYPES[kind]) for name, (a, b, kind) in told["arrays"].items()}
+    for role, bodies in film.scenes.kinds.items():
+        codes = arrays[f"{role}.position"].reshape(bodies.position.shape)
+        np.testing.assert_allclose(codes / 65534 * 100, bodies.position, atol=100 / 65534)
+        assert told["kinds"][role]["count"] == bodies.position.shape[1]
+    turned = arrays["agents.heading"].reshape(film.scenes.agents.heading.shape) * (np.pi / 128)
+    assert np.cos(turned - film.scenes.agents.heading).min() > np.cos(np.pi / 255)
+    shares = ((arrays["shares"].reshape(film.shares.shape).astype(float) - 1) / 254) ** 4
+    np.testing.assert_allclose(shares, film.shares, rtol=0.03, atol=1e-4)
+    np.testing.assert_allclose(arrays["score"], film.score, rtol=1e-6)
+    assert len(told["catches"]) == ("num_evaders" in kinds)
+    assert [goal["group"] for goal in told["goals"]] == ([0, 1] if "num_boxes" in kinds else [])
+
+
+def test_absent_bodies_and_those_not_perceived_have_codes_of_their_own():
+    position, low, high = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]]), np.zeros(2), np.ones(2)
+    codes = page.quantise_positions(position, np.array([True, True, False]), low, high)
+    np.testing.assert_array_equal(codes, [[0, 0], [65534, 65534], [65535, 65535]])
+    np.testing.assert_array_equal(page.quantise_shares(np.array([np.nan, 0.0, 1.0])), [0, 1, 255])
+
+
+def test_a_page_asks_for_nothing_from_outside():
+    text = page.html([episode()])
+    assert not re.findall(r"(?:src|href)\s*=\s*[\"'](?!data:)|https?://|@import|fetch\(|localStorage", text)
+    assert text.count("</script>") == 4  # titles cannot end a script
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_large_swarms_stay_below_10_mb(kept):
+    """200 agents, 1024 steps; random numbers are the worst that can be compressed."""
+    film = episode(1025, 200, shares=False)
+    if kept:
+        every = -(-1025 // (MAX_SHARES // 200**2))
+        shares = np.random.default_rng(0).dirichlet(np.ones(200), (-(-1025 // every), 200))
+        film = dataclasses.replace(film, shares=shares, shares_every=every)
+    assert len(page.html([film])) < 10e6
+
+
+@pytest.mark.parametrize("kinds", [{"num_evaders": 2}, {"num_boxes": 4}])
+def test_a_strip_has_a_row_for_each_film(kinds, tmp_path):
+    render.write(tmp_path / "a.png", [episode(**kinds)], frames=3, until=20)
+    render.write(tmp_path / "b.png", [episode(**kinds), episode(seed=1)], frames=3)
+    with Image.open(tmp_path / "a.png") as one, Image.open(tmp_path / "b.png") as two:
+        assert one.width == two.width
+        assert two.height == 2 * one.height
+        assert len(one.convert("RGB").getcolors(2**24)) > 50
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
+
+
+def test_a_gif_has_so_many_pictures(tmp_path):
+    render.write(tmp_path / "a.gif", [episode(num_evaders=1)], frames=4)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 4
+        assert image.info["duration"] == 50
+
+
+@pytest.mark.skipif(not shutil.which("ffmpeg"), reason="ffmpeg is not installed")
+def test_an_mp4_is_written_by_ffmpeg(tmp_path):
+    render.write(tmp_path / "a.mp4", [episode(num_evaders=1)], until=3)
+    assert b"ftyp" in (tmp_path / "a.mp4").read_bytes()[:12]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "part"),
+    [
+        ("a.jpg", {}, ".html, .png, .gif, .mp4"),
+        ("a.html", {"frames": 3}, "accepted: .png, .gif"),
+        ("a.mp4", {}, "ffmpeg"),
+    ],
+)
+def test_what_cannot_be_written_is_said(name, options, part, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(render.RenderError, match=re.escape(part)):
+        render.write(tmp_path / name, [episode()], **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    """The folder of a run that has just begun."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        run_dir = tmp_path_factory.mktemp("runs") / "run"
+        run_dir.mkdir()
+        config = configs.compose(TINY)
+        (run_dir / "config.yaml").write_text(configs.dump(config))
+        checkpoints = Checkpoints(run_dir / "checkpoints")
+        state = init(configs.build(config), jax.random.key(0))
+        checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
+        checkpoints.close()
+        yield run_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+def test_a_replay_in_the_run_folder(run_dir):
+    experiment = configs.build(configs.load(run_dir / "config.yaml"))
+    params = init(experiment, jax.random.key(0)).learner.params
+    path = render.write_replay(run_dir, experiment, params, update=7)
+    (film,) = unpack(path.read_text())[0]["films"]
+    assert film["title"] == "rendezvous of 3 agents, after update 7"
+    assert film["frames"] == 6
+
+
+def test_runs_are_rendered_side_by_side(run_dir, tmp_path, capsys):
+    assert program.main([str(run_dir), str(run_dir), "checkpoint=last", "seed=2", f"out={tmp_path / 'two.html'}"]) == 0
+    about = unpack((tmp_path / "two.html").read_text())[0]
+    assert [film["title"] for film in about["films"]] == ["run, rendezvous of 3 agents, after update 1"] * 2
+    assert "5 steps, return -" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["out=a.jpg"], "accepted: names that end in .html"),
+        (["checkpoint=first"], "accepted: best, last"),
+        (["frames=0", "out=a.png"], "frames = 0"),
+        (["frames=3"], "frames is not possible for .html"),
+        (["num_worlds=3"], "num_worlds cannot be changed here"),
+        (["task.dynamics=velocity"], "observations of other sizes"),
+        (["nowhere"], "nowhere is not a run folder"),
+    ],
+)
+def test_a_wrong_command_is_one_line(run_dir, capsys, words, part):
+    assert program.main([str(run_dir), *words]) == 2
+    err = capsys.readouterr().err
+    assert part in err
+    assert err.count("\n") == 1
+
+
+def test_training_does_not_fail_by_a_replay(run_dir, capsys):
+    experiment = configs.build(configs.load(run_dir / "config.yaml"))
+    assert render.write_replay(run_dir, experiment, {"params": {}}, update=1, name="broken.html") is None
+    assert "warning: no broken.html: " in capsys.readouterr().err
+    assert not (run_dir / "broken.html").exists()
+
+
+def test_replays_are_written_at_every_so_many_evaluations(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(render, "write_replay", lambda *_, update, name: written.append((update, name)))
+    on_evaluation = render.hook(tmp_path, None, 2)
+    for update in (0, 10, 20, 30):
+        on_evaluation(update, None)
+    assert written == [(0, "replay-0.html"), (20, "replay-20.html")]
