@@ -41,6 +41,7 @@ class Run:
     total_agent_steps: int | None = None
     checkpoint_seconds: float = 30.0
     keep_checkpoints: int = 3
+    render_every: int | None = None
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,6 +59,7 @@ def fit(
     keep_checkpoints: int = 3,
     log_to: tuple[str, ...] = (),
     config: Mapping[str, Any] | None = None,
+    on_evaluation: Callable[[int, Any], None] | None = None,
 ) -> tuple[TrainState, list[Row]]:
     """Trains until `num_updates` updates are done, or until Ctrl-C or SIGTERM, after the current chunk.
 
@@ -67,7 +68,8 @@ def fit(
     row before. With `num_seeds` the seeds from `seed` on are trained side by side: the state has a leading axis, and
     there is a row for each. A seed whose numbers stop being finite stays as it was before.
 
-    `log_to` are names in `loggers.LOGGERS`, to which `config` is shown.
+    `log_to` are names in `loggers.LOGGERS`, to which `config` is shown; `on_evaluation` is called with the update and
+    the parameters [seeds, ...] of each evaluated policy but the last.
 
     With `run_dir` the folder gets `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and
     the best, at most every `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last
@@ -75,7 +77,7 @@ def fit(
     but none can be restored, and `FileExistsError` for a folder with another run in it.
     """
     seeds = tuple(range(seed, seed + (num_seeds or 1)))
-    run = Run(experiment, seeds, None if run_dir is None else Path(run_dir), log_to, config)
+    run = Run(experiment, seeds, None if run_dir is None else Path(run_dir), log_to, config, on_evaluation)
     states, (rows,) = fit_runs(
         [run],
         num_updates,
@@ -146,7 +148,7 @@ def _train(states: TrainState, num_updates: int, desk: "_Desk", stop: threading.
         length, is_due, is_stopped = _agreed(length, desk.is_checkpoint_due(), stop.is_set())
         if is_stopped:
             break
-        is_wanted = desk.writes and (update % eval_every == 0 or is_due)
+        is_wanted = desk.needs_states and (update % eval_every == 0 or is_due)
         before = _copy(states) if is_wanted else None
         states, metrics = program(desk.batch.experiments, states, np.int32(length))
         if in_flight:
@@ -192,7 +194,8 @@ class _Desk:
         self.recorders = recorders
         self.progress = progress
         self.start = start
-        self.writes = any(_agreed(*[recorder.run.run_dir is not None for recorder in recorders]))
+        runs = [recorder.run for recorder in recorders]
+        self.needs_states = any(_agreed(*[bool(run.run_dir or run.on_evaluation) for run in runs]))
         self._checkpoint_seconds = checkpoint_seconds
         self._started = time.monotonic() - wall_seconds
         self._wall_seconds = wall_seconds  # when the last recorded chunk was done

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ class Run:
     run_dir: Path | None = None
     loggers: tuple[str, ...] = ()  # names in `LOGGERS`, which need a folder
     config: Mapping[str, Any] | None = None  # what the loggers show of it
+    on_evaluation: Callable[[int, Any], None] | None = None  # called with updates done and parameters [seeds, ...]
 
 
 @dataclasses.dataclass
@@ -90,6 +91,8 @@ class Recorder:
         self._since_evaluation = {name: self._since_evaluation.get(name, []) for name in training}
         if is_evaluated:
             self._add_rows(start, wall_seconds, evaluation)
+        if is_evaluated and states is not None and self.run.on_evaluation:
+            self.run.on_evaluation(start, states.learner.params)
         if states is not None and self._checkpoints:
             self._consider(_Candidate(start, states, record, self._score(evaluation) if is_evaluated else None))
         for name, x in training.items():

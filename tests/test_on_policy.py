@@ -104,7 +104,8 @@ def test_fetched_samples_are_those_of_the_trajectory():
     np.testing.assert_allclose(batch.obs.groups["neighbors"].features[1, 0], obs.own[2, 1, 0])
 
 
-@pytest.mark.parametrize(("name", "std"), [("ppo", "shared"), pytest.param("trl", "state", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "std"), [("ppo", "shared"), ("trl", "state")])
 def test_agents_that_do_not_exist_have_no_influence_on_an_update(name, std):
     task = TASKS["rendezvous"](num_agents=4, active_agents=(2, 3), episode_length=4)
     network, params, trajectory, _ = random_trajectory(task, std=std)

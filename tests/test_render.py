@@ -5,6 +5,7 @@ import dataclasses
 import json
 import re
 import shutil
+import types
 import zlib
 
 import jax
@@ -240,7 +241,8 @@ def test_training_does_not_fail_by_a_replay(run_dir, capsys):
 def test_replays_are_written_at_every_so_many_evaluations(tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(render, "write_replay", lambda *_, update, name: written.append((update, name)))
-    on_evaluation = render.hook(tmp_path, None, 2)
+    experiment = types.SimpleNamespace(eval_every=10)
+    on_evaluation = render.hook(tmp_path, experiment, 2)
     for update in (0, 10, 20, 30):
-        on_evaluation(update, None)
+        on_evaluation(update, {"w": np.zeros((3, 2))})
     assert written == [(0, "replay-0.html"), (20, "replay-20.html")]

@@ -141,6 +141,7 @@ def test_discs_end_where_box2d_leaves_them(name):
     np.testing.assert_allclose(state.position[: len(expected)], expected[:, :2], atol=5e-5)
 
 
+@pytest.mark.slow
 def test_ten_discs_and_four_boxes_move_as_in_box2d():
     record = GOLDEN["random"]
     start = bodies(record["discs"], record["boxes"], np.zeros((4, 3)), np.ones(4, bool))
@@ -240,6 +241,7 @@ def crowd_and_images():
     return replay_worlds(FAITHFUL, jnp.float32(0.5), states, command_of_each)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IMAGES)
 def test_images_of_a_world_stay_its_images(name):
     image, atol = IMAGES[name]
@@ -252,6 +254,7 @@ def test_images_of_a_world_stay_its_images(name):
     np.testing.assert_allclose(np.exp(1j * end.box_heading), np.exp(1j * expected.box_heading), atol=20 * atol)
 
 
+@pytest.mark.slow
 def test_one_world_moves_as_among_many():
     start, command = crowd()
     alone, among = replay(FAITHFUL, jnp.float32(0.5), start, command), at(crowd_and_images(), 0)

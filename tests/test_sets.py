@@ -84,7 +84,7 @@ def test_layouts_agree_in_their_gradients(name, layout):
         assert_close(other(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed)))
 
 
-@pytest.mark.parametrize("name", ["bayesian", "attentive, query"])
+@pytest.mark.parametrize("name", ["bayesian", pytest.param("attentive, query", marks=pytest.mark.slow)])
 def test_pieces_agree_with_the_whole(name, monkeypatch):
     monkeypatch.setattr(
         sets,

@@ -155,6 +155,7 @@ def test_worlds_are_batched_by_vmap(task):
         assert_close(jax.tree.map(lambda leaf, i=world: leaf[i], (states, steps, all_obs)), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_compiled_steps_are_those_of_plain_python(task):
     if hasattr(task, "physics"):
         pytest.skip("a step of rigid bodies is a minute of single operations; test_rigid2d has closed forms and Box2D")
@@ -164,6 +165,7 @@ def test_compiled_steps_are_those_of_plain_python(task):
     assert_close(step(task, KEY, start, action), plain, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_numbers_are_leaves_to_be_mapped_over(task):
     names = number_fields(task)
     assert "side" in names

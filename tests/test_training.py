@@ -126,6 +126,7 @@ def test_impossible_sizes_are_named(changes, message):
         EXPERIMENT.replace(**changes)
 
 
+@pytest.mark.slow
 def test_desynchronised_worlds_start_at_random_times():
     experiment = Experiment(
         TASK.replace(episode_length=1000), NETWORK, LEARNER, **SIZES | {"num_worlds": 50, "num_steps": 12}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
+from jaxswarm.cli.policies import load_policies
 from jaxswarm.cli.words import (
     command,
     join_processes,
@@ -85,6 +86,7 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     num_updates = run.length(experiment.agent_steps_per_update)
     use_compile_cache()
     use_cores(run.num_seeds)
+    from jaxswarm import render  # noqa: PLC0415
     from jaxswarm.checkpoint import CheckpointError, replace_text  # noqa: PLC0415
     from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
 
@@ -107,6 +109,7 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
             keep_checkpoints=run.keep_checkpoints,
             log_to=run.loggers,
             config=config,
+            on_evaluation=render.hook(run_dir, experiment, run.render_every) if run.render_every else None,
         )
     except (DivergedError, CheckpointError) as error:
         print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
@@ -115,9 +118,10 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     if update < num_updates:
         print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
         return 0
-    from jaxswarm import render  # noqa: PLC0415
-
-    render.write_replay(run_dir, experiment, render.of_seed(train_state.learner.params, 0), update=update)
+    if is_first:
+        policies = load_policies(run_dir, config, "last", run.seeds[:1])
+        assert policies
+        render.write_replay(run_dir, experiment, render.of_seed(policies.params, 0), update=update)
     if rows:
         first, last = (_return_at(rows, rows[index]["update"]) for index in (0, -1))
         print(f"done: {update} updates, return {last} (untrained {first})")

@@ -87,16 +87,13 @@ def write_replay(run_dir: Path, experiment: Any, params: Any, *, update: int, na
 
 
 def hook(run_dir: Path, experiment: Any, render_every: int) -> Callable[[int, Any], None]:
-    """To be called with update and parameters at every evaluation; of each `render_every`-th it writes a replay.
+    """What `fit` calls at evaluations; of each `render_every`-th it writes a replay of the first seed's policy.
 
     The first evaluation, of the untrained policy, is one of these. The files are `replay-<update>.html`.
     """
-    evaluations = 0
 
     def on_evaluation(update: int, params: Any) -> None:
-        nonlocal evaluations
-        if evaluations % render_every == 0:
-            write_replay(run_dir, experiment, params, update=update, name=f"replay-{update}.html")
-        evaluations += 1
+        if update // experiment.eval_every % render_every == 0:
+            write_replay(run_dir, experiment, of_seed(params, 0), update=update, name=f"replay-{update}.html")
 
     return on_evaluation
