@@ -49,11 +49,6 @@ class Measured:
         reached = np.flatnonzero(_smooth(self.line.y) >= start + fraction * (final - start))
         return float(self.line.x[reached[0]]) if reached.size else math.nan
 
-    def setback(self, until: float) -> float:
-        """How far the smoothed median has fallen from its best so far, at most, until then."""
-        y = _smooth(self.line.y)[self.line.x <= until]
-        return float((np.maximum.accumulate(y) - y).max(initial=0.0))
-
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
@@ -64,7 +59,7 @@ class Claim:
     series: tuple[str, ...]
     low: float = -math.inf
     high: float = math.inf
-    at: float = math.nan  # agent steps, of the kinds that ask for a point or for all before it
+    at: float = math.nan  # agent steps, of the kinds that ask for a point
     fraction: float = math.nan  # of the way to the final level, of the kinds that ask when
 
     def number(self, series: Mapping[str, Measured]) -> float:
@@ -87,9 +82,7 @@ class Verdict:
     num_seeds: int
 
 
-def judge(
-    claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measured], enough: int
-) -> Verdict:
+def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measured], enough: int) -> Verdict:
     """The verdict, which takes `enough` seeds of every series, trained to their end."""
     thesis = claim.number(theirs) if theirs.keys() >= set(claim.series) else math.nan
     num_seeds = min(ours[name].num_seeds if name in ours else 0 for name in claim.series)
@@ -148,5 +141,4 @@ KINDS: dict[str, Callable[[Claim, Sequence[Measured]], float]] = {
     "lead": _lead,  # at a point, of the first series over the best of the others
     "steps": lambda claim, series: series[0].steps_to(claim.fraction),  # to a fraction of the way
     "pace": _pace,  # the steps of the first series over those of the second
-    "setback": lambda claim, series: max(one.setback(claim.at) for one in series),  # the worst of the series
 }

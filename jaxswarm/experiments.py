@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxswarm import claims, curves, plots, reporting, runs, sweep
+from jaxswarm import claims, curves, plots, reporting, runs
 from jaxswarm import config as configs
 from jaxswarm.checkpoint import replace_text
 from jaxswarm.claims import Claim, Measured, Verdict
@@ -67,15 +67,28 @@ def load(name: str) -> Figure:
     return Figure(name=name, references=_references(CURVES / f"{reference}.csv") if reference else {}, **fields)
 
 
+def stored(directory: Path) -> list[RunFolder]:
+    """All runs in the directory, of any figure."""
+    return [runs.read(path) for path in runs.find([directory])] if any(directory.glob("*/manifest.json")) else []
+
+
 def plan(
-    figure: Figure, directory: Path, num_seeds: int | None = None, scale: float = 1.0, words: Sequence[str] = ()
+    figure: Figure,
+    directory: Path,
+    found: Sequence[RunFolder] = (),
+    num_seeds: int | None = None,
+    scale: float = 1.0,
+    words: Sequence[str] = (),
 ) -> dict[str, Trial]:
-    """The trial of each series, `scale` times as long as the figure shows it; `words` change all of them."""
-    stored = _stored(directory)
-    return {
-        series: _trial(_cut(figure, [*own, *words], num_seeds or figure.num_seeds, scale), directory, stored)
+    """The trial of each series, in the folder that was found to have its experiment and seeds, or else in a new one.
+
+    It is `scale` times as long as what the figure shows of it; `words` change all series.
+    """
+    wanted = {
+        series: _cut(figure, [*own, *words], num_seeds or figure.num_seeds, scale)
         for series, own in figure.series.items()
     }
+    return {series: _trial(config, directory, found) for series, config in wanted.items()}
 
 
 def is_finished(trial: Trial) -> bool:
@@ -86,23 +99,23 @@ def is_finished(trial: Trial) -> bool:
 
 
 def measure(
-    figure: Figure, trials: Mapping[str, Trial], directory: Path, warn: Callable[[str], object]
+    figure: Figure, trials: Mapping[str, Trial], found: Sequence[RunFolder], warn: Callable[[str], object]
 ) -> dict[str, Measured]:
-    """What all seeds of the figure's series came to that any folder holds; series without any are left out.
+    """What all seeds of the figure's series came to that any run holds; series without any are left out.
 
     As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
     """
-    stored, measured = _stored(directory), {}
+    measured = {}
     for series, trial in trials.items():
         per_update = trial.experiment.agent_steps_per_update
         fields, end = runs.fields(trial.config), figure.num_updates * per_update
-        same = [folder for folder in stored if folder.config == fields]
+        same = [folder for folder in found if folder.config == fields]
         seeds = runs.seeds(same, "agent_steps", RETURN, warn) if any(folder.rows for folder in same) else []
         if seeds:
             shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
             line = _until(curves.summarize(shifted, "median"), end)
-            reference = figure.references.get(series, line)
-            measured[series] = Measured(line, reference, min(end, reference.x[-1]) if reference is not line else end)
+            reference = figure.references.get(series)
+            measured[series] = Measured(line, reference or line, float(reference.x[-1]) if reference else end)
     return measured
 
 
@@ -152,16 +165,9 @@ def _cut(figure: Figure, words: Sequence[str], num_seeds: int, scale: float) -> 
     return configs.override(config, [("num_updates", num_updates), ("num_seeds", num_seeds)])
 
 
-def _stored(directory: Path) -> list[RunFolder]:
-    """All run folders of the directory, of any figure."""
-    is_empty = not any(directory.glob("*/config.yaml"))
-    return [] if is_empty else [runs.read(path) for path in runs.find([directory])]
-
-
-def _trial(config: Config, directory: Path, stored: Sequence[RunFolder]) -> Trial:
-    """A trial in the folder that has the same experiment and seeds, or else in a new one."""
+def _trial(config: Config, directory: Path, found: Sequence[RunFolder]) -> Trial:
     fields, seeds = runs.fields(config), configs.run_settings(config).seeds
-    for folder in stored:
+    for folder in found:
         others = configs.run_settings(configs.load(folder.path / "config.yaml")).seeds
         if folder.config == fields and others == seeds:
             return Trial(config, configs.build(config), folder.path)
