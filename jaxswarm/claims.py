@@ -27,7 +27,7 @@ class Measured:
     @property
     def is_cut(self) -> bool:
         """Whether the series ends before it should."""
-        return self.line.x[-1] < (1 - TOLERANCE) * self.end
+        return bool(self.line.x[-1] < (1 - TOLERANCE) * self.end)
 
     @property
     def num_seeds(self) -> int:
@@ -68,7 +68,7 @@ class Claim:
 
     def holds(self, number: float) -> bool:
         """Whether it is in the range; NaN never is."""
-        return self.low <= number <= self.high
+        return bool(self.low <= number <= self.high)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -62,7 +62,7 @@ def load(name: str) -> Figure:
     fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
     words, reference = fields.pop("words").split(), fields.pop("reference", None)
     fields["series"] = {series: (*words, *own.split()) for series, own in fields["series"].items()}
-    fields["claims"] = tuple(Claim(**claim | {"series": tuple(claim["series"])}) for claim in fields["claims"])
+    fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
     fields["y"] = tuple(fields.pop("y", ["linear"]))
     return Figure(name=name, references=_references(CURVES / f"{reference}.csv") if reference else {}, **fields)
 
@@ -144,6 +144,10 @@ def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Pa
         replace_text(out / f"{figure.name}.csv", plots.table(picture))
         files.append(out / f"{name}.png")
     return [*files, out / f"{figure.name}.csv"]
+
+
+def _claim(says: str, kind: str, series: Sequence[str], **numbers: int | float) -> Claim:
+    return Claim(says, kind, tuple(series), **{name: float(x) for name, x in numbers.items()})
 
 
 def _references(path: Path) -> dict[str, Line]:

@@ -1,6 +1,7 @@
 """Figures of the thesis: their configs against its numbers, claims on made-up curves, and one trained end to end."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -108,14 +109,17 @@ TINY = [
 ]
 
 
-def num_parameters(experiment, cache={}):  # noqa: B006
-    """Of actor and critic, heads and standard deviation; of networks that figures share, once."""
-    task, network = experiment.task, experiment.network
-    key = repr((task, network))
-    if key not in cache:
-        shapes = jax.eval_shape(lambda key: network.init(key, task.observe(task.reset(key))), jax.random.key(0))
-        cache[key] = sum(math.prod(x.shape) for x in jax.tree.leaves(shapes))
-    return cache[key]
+@functools.cache
+def observation(task):
+    """Its shapes, which take a while for boxes."""
+    return jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
+
+
+@functools.cache
+def num_parameters(task, network):
+    """Of actor and critic, heads and standard deviation."""
+    shapes = jax.eval_shape(network.init, jax.random.key(0), observation(task))
+    return sum(math.prod(x.shape) for x in jax.tree.leaves(shapes))
 
 
 def test_every_figure_is_in_the_table():
@@ -139,7 +143,7 @@ def test_every_series_is_what_was_run(name):
         assert run.network.latent_space == ("shared" if "single space" in series else "separate")
         assert {field: getattr(run.learner, field) for field in LEARNING} == LEARNING
         assert (run.eval_every, run.eval_worlds, run.desynchronised_start) == (1, 20, False)
-        assert count in (None, num_parameters(run)), series
+        assert count is None or count == num_parameters(run.task, run.network), series
 
 
 def test_tasks_are_those_of_the_thesis():
@@ -202,8 +206,8 @@ SERIES = {"a": measured(ramp(10.0, 40.0)), "b": measured(ramp(8.0, 20.0)), "c": 
         ("order", "acb", {}, -4.0),
         ("level", "ab", {"at": 20.0}, 5.0),
         ("lead", "bac", {"at": 10.0}, 1.5),
-        ("steps", "a", {"fraction": 0.5}, 20.0),
-        ("pace", "ca", {"fraction": 0.5}, 2.0),
+        ("steps", "a", {"fraction": 0.51}, 21.0),
+        ("pace", "ca", {"fraction": 0.51}, 2.0),
     ],
 )
 def test_each_kind_of_claim_is_a_number(kind, series, fields, expected):
