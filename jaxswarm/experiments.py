@@ -183,4 +183,4 @@ def _trial(config: Config, directory: Path, found: Sequence[RunFolder]) -> Trial
 def _until(line: Line, end: float) -> Line:
     """The part of a line that a figure shows, and at least its first point."""
     size = max(1, int(np.searchsorted(line.x, end * (1 + 1e-9), side="right")))
-    return Line(*(x[:size] for x in (line.x, line.y, line.lower, line.upper, line.num_seeds)))
+    return Line(line.x[:size], line.y[:size], line.lower[:size], line.upper[:size], line.num_seeds[:size])

@@ -116,10 +116,19 @@ def observation(task):
 
 
 @functools.cache
-def num_parameters(task, network):
-    """Of actor and critic, heads and standard deviation."""
-    shapes = jax.eval_shape(network.init, jax.random.key(0), observation(task))
-    return sum(math.prod(x.shape) for x in jax.tree.leaves(shapes))
+def compose(words):
+    return configs.compose(words)
+
+
+def num_parameters(experiment, counted={}):  # noqa: B006
+    """Of actor and critic, heads and standard deviation; once for networks that see the same features."""
+    obs, network = observation(experiment.task), experiment.network
+    features = {name: group.features.shape[-1] for name, group in obs.groups.items()}
+    key = (network, obs.own.shape[-1], tuple(sorted(features.items())))
+    if key not in counted:
+        shapes = jax.eval_shape(network.init, jax.random.key(0), obs)
+        counted[key] = sum(math.prod(x.shape) for x in jax.tree.leaves(shapes))
+    return counted[key]
 
 
 def test_every_figure_is_in_the_table():
@@ -133,7 +142,7 @@ def test_every_series_is_what_was_run(name):
     figure = experiments.load(name)
     assert list(figure.series) == list(expected)
     for series, (num_worlds, aggregator, learner, network, count) in expected.items():
-        config = configs.compose(figure.series[series])
+        config = compose(figure.series[series])
         run = configs.build(config)
         assert (config["aggregator"]["name"], config["learner"]["name"]) == (aggregator, learner)
         assert run.num_worlds * run.num_steps * run.task.num_agents == per_update
@@ -143,12 +152,12 @@ def test_every_series_is_what_was_run(name):
         assert run.network.latent_space == ("shared" if "single space" in series else "separate")
         assert {field: getattr(run.learner, field) for field in LEARNING} == LEARNING
         assert (run.eval_every, run.eval_worlds, run.desynchronised_start) == (1, 20, False)
-        assert count is None or count == num_parameters(run.task, run.network), series
+        assert count is None or count == num_parameters(run), series
 
 
 def test_tasks_are_those_of_the_thesis():
     def task(name):
-        return configs.build(configs.compose(next(iter(experiments.load(name).series.values())))).task
+        return configs.build(compose(next(iter(experiments.load(name).series.values())))).task
 
     rendezvous, one, several = task("fig_6_1"), task("fig_6_3"), task("fig_6_5")
     assert (rendezvous.num_agents, rendezvous.torus, rendezvous.relative_velocity) == (20, False, "thesis")
