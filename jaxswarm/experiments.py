@@ -108,7 +108,7 @@ def measure(
     measured = {}
     for series, trial in trials.items():
         per_update = trial.experiment.agent_steps_per_update
-        fields, end = runs.fields(trial.config), figure.num_updates * per_update
+        fields, end = runs.fields(trial.config), float(figure.num_updates * per_update)
         same = [folder for folder in found if folder.config == fields]
         seeds = runs.seeds(same, "agent_steps", RETURN, warn) if any(folder.rows for folder in same) else []
         if seeds:
@@ -126,7 +126,8 @@ def of_thesis(figure: Figure) -> dict[str, Measured]:
 
 def verdicts(figure: Figure, measured: Mapping[str, Measured]) -> list[Verdict]:
     """One for each claim."""
-    return [claims.judge(claim, measured, of_thesis(figure), figure.num_seeds) for claim in figure.claims]
+    theirs = of_thesis(figure)
+    return [claims.judge(claim, measured, theirs, figure.num_seeds) for claim in figure.claims]
 
 
 def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
