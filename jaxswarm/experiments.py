@@ -158,8 +158,8 @@ def _references(path: Path) -> dict[str, Line]:
     for name in dict.fromkeys(row["series"] for row in rows):
         columns = ("n_runs", "agent_steps", "median", "q25", "q75")
         mine = [[float(row[column] or "nan") for column in columns] for row in rows if row["series"] == name]
-        num_runs, *points = np.array(mine).T
-        lines[name] = Line(*points, num_runs.astype(int))
+        num_runs, x, middle, lower, upper = np.array(mine).T
+        lines[name] = Line(x, middle, lower, upper, num_runs.astype(int))
     return lines
 
 
