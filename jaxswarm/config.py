@@ -24,6 +24,7 @@ Config = dict[str, Any]
 REGISTERED = ("task", "aggregator", "learner")  # groups whose files have a `name`
 PARTS = (*REGISTERED, "network")  # what an experiment is made of, one dict each
 SEARCHES = "search"  # the folder of search spaces, which are no part of a config
+FIGURES = "figure"  # that of figures, each of several configs
 LENGTHS = ("num_updates", "total_agent_steps")  # two ways to say the same
 
 
@@ -80,7 +81,8 @@ def config_dir() -> Path:
 
 def choices() -> dict[str, list[str]]:
     """Names of the groups, and of the files in each."""
-    groups = sorted(path for path in config_dir().iterdir() if path.is_dir() and path.name != SEARCHES)
+    others = (SEARCHES, FIGURES)
+    groups = sorted(path for path in config_dir().iterdir() if path.is_dir() and path.name not in others)
     return {group.name: sorted(path.stem for path in group.glob("*.yaml")) for group in groups}
 
 

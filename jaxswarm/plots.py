@@ -129,7 +129,10 @@ def _in_units(picture: Picture) -> Picture:
 
 
 def _draw_lines(axes: "Axes", picture: Picture) -> None:
-    """Our lines by their place, the references behind them in tints of the colours that remain."""
+    """Our lines by their place, the references behind them in a tint of the colour of the line with the same name.
+
+    Those without a namesake have tints of the colours that remain.
+    """
     ours = [series for series in picture.series if not series.is_reference]
     references = [series for series in picture.series if series.is_reference]
     for number, series in enumerate(ours):
@@ -139,8 +142,9 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
         marks = {"marker": marker, "markersize": 4, "markevery": (number % every, every)}
         style |= marks | ({"drawstyle": "steps-post"} if picture.is_step else {})
         _draw_line(axes, series, picture.is_step, 0.2, style)
+    places = {series.label: number for number, series in enumerate(ours)}
     for number, series in enumerate(references):
-        color = _tint(COLORS[(len(ours) + number) % len(COLORS)])
+        color = _tint(COLORS[places.get(series.label, len(ours) + number) % len(COLORS)])
         style = {"color": color, "linewidth": 1.4, "linestyle": DASHES[number % len(DASHES)], "zorder": 2}
         _draw_line(axes, series, picture.is_step, 0.12, style)
     if len(ours) == 1 and len(ours[0].line.x) and not picture.is_step:

@@ -18,5 +18,6 @@ def test_a_wheel_holds_all_modules_default_configs_and_the_page(tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "jaxswarm").rglob("*.py")}
     configs = {f"jaxswarm/{path.relative_to(ROOT)}" for path in (ROOT / "configs").rglob("*.yaml")}
-    assert modules | configs | {"jaxswarm/render/replay.html"} <= names
+    curves = {str(path.relative_to(ROOT)) for path in (ROOT / "jaxswarm" / "data").rglob("*.csv")}
+    assert modules | configs | curves | {"jaxswarm/render/replay.html"} <= names
     assert not [name for name in names if name.startswith(("tests", "configs", "benchmarks"))]

@@ -1,0 +1,144 @@
+"""Claims about learning curves: a number that follows from them, and the range in which it has to be.
+
+Curves are medians over seeds, measured as the thesis measured its own, and the same number is computed of both.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from jaxswarm.curves import Line, Points
+
+LAST = 0.1  # share of a curve that makes up its final level
+SMOOTHED = 5  # evaluations, centred, before it is asked when a curve reaches a level
+TOLERANCE = 1e-3  # share of a curve that may be missing at its end
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A series; `reference` is the curve to compare with, which says where it ends and what its levels are."""
+
+    line: Line
+    reference: Line
+    end: float  # agent steps where the last tenth is over
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the series ends before it should."""
+        return bool(self.line.x[-1] < (1 - TOLERANCE) * self.end)
+
+    @property
+    def num_seeds(self) -> int:
+        """Those that have reached the end."""
+        return int(np.interp(self.end, self.line.x, self.line.num_seeds))
+
+    def final(self, values: Points | None = None) -> float:
+        """Mean over the last tenth: of the median, or of a quartile."""
+        values = self.line.y if values is None else values
+        return _final(self.line.x, values, self.end)
+
+    def at(self, steps: float) -> float:
+        """The smoothed median after so many agent steps, NaN beyond its end."""
+        return float(np.interp(steps, self.line.x, _smooth(self.line.y), right=math.nan))
+
+    def steps_to(self, fraction: float) -> float:
+        """Agent steps to this share of the reference's way from its start to its final level; NaN if never."""
+        start, final = self.reference.y[0], _final(self.reference.x, self.reference.y, self.reference.x[-1])
+        reached = np.flatnonzero(_smooth(self.line.y) >= start + fraction * (final - start))
+        return float(self.line.x[reached[0]]) if reached.size else math.nan
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """A sentence, and the number that decides it: of a kind of `KINDS`, for these series, from `low` to `high`."""
+
+    says: str
+    kind: str
+    series: tuple[str, ...]
+    low: float = -math.inf
+    high: float = math.inf
+    at: float = math.nan  # agent steps, of the kinds that ask for a point
+    fraction: float = math.nan  # of the way to the final level, of the kinds that ask when
+
+    def number(self, series: Mapping[str, Measured]) -> float:
+        """What the claim is about; NaN where a series never gets there."""
+        return KINDS[self.kind](self, [series[name] for name in self.series])
+
+    def holds(self, number: float) -> bool:
+        """Whether it is in the range; NaN never is."""
+        return bool(self.low <= number <= self.high)
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What became of a claim, with the number here and in the thesis; NaN where there is none."""
+
+    claim: Claim
+    outcome: str  # reproduced, not reproduced, not enough runs, run was cut
+    here: float
+    thesis: float
+    num_seeds: int
+
+
+def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measured], enough: int) -> Verdict:
+    """The verdict, which takes `enough` seeds of every series, trained to their end."""
+    thesis = claim.number(theirs) if theirs.keys() >= set(claim.series) else math.nan
+    num_seeds = min(ours[name].num_seeds if name in ours else 0 for name in claim.series)
+    if not ours.keys() >= set(claim.series):
+        return Verdict(claim, "not enough runs", math.nan, thesis, 0)
+    here = claim.number(ours)
+    if any(ours[name].is_cut for name in claim.series):
+        outcome = "run was cut"
+    elif num_seeds < enough:
+        outcome = "not enough runs"
+    else:
+        outcome = "reproduced" if claim.holds(here) else "not reproduced"
+    return Verdict(claim, outcome, here, thesis, num_seeds)
+
+
+def _final(x: Points, values: Points, end: float) -> float:
+    end = min(end, x[-1])
+    return float(np.interp(np.linspace((1 - LAST) * end, end, 50), x, values).mean())
+
+
+def _smooth(values: Points) -> Points:
+    """Centred means; at the ends the first and the last value count for those that would be beyond."""
+    padded = np.pad(values, SMOOTHED // 2, mode="edge")
+    return np.convolve(padded, np.full(SMOOTHED, 1 / SMOOTHED), mode="valid")
+
+
+def _finals(series: Sequence[Measured]) -> np.ndarray:
+    return np.array([one.final() for one in series])
+
+
+def _spread(_: Claim, series: Sequence[Measured]) -> float:
+    return float(np.ptp(_finals(series)))
+
+
+def _order(_: Claim, series: Sequence[Measured]) -> float:
+    return float(-np.diff(_finals(series)).max())
+
+
+def _lead(claim: Claim, series: Sequence[Measured]) -> float:
+    first, *others = (one.at(claim.at) for one in series)
+    return first - max(others)
+
+
+def _pace(claim: Claim, series: Sequence[Measured]) -> float:
+    first, second = (one.steps_to(claim.fraction) for one in series)
+    return first / second
+
+
+KINDS: dict[str, Callable[[Claim, Sequence[Measured]], float]] = {
+    "final": lambda _, series: series[0].final(),  # the final level
+    "lower_quartile": lambda _, series: series[0].final(series[0].line.lower),  # of the final level
+    "difference": lambda _, series: series[0].final() - series[1].final(),  # of two final levels
+    "spread": _spread,  # between the highest and the lowest final level
+    "order": _order,  # the smallest distance of a final level to that of the next series
+    "level": lambda claim, series: min(one.at(claim.at) for one in series),  # the lowest of the series, at a point
+    "lead": _lead,  # at a point, of the first series over the best of the others
+    "steps": lambda claim, series: series[0].steps_to(claim.fraction),  # to a fraction of the way
+    "pace": _pace,  # the steps of the first series over those of the second
+}

@@ -1,0 +1,128 @@
+"""The program `jaxswarm-experiment`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxswarm import config as configs
+from jaxswarm.checkpoint import replace_text
+from jaxswarm.cli.words import command, program, split, use_compile_cache, use_cores, wants_help, whole
+from jaxswarm.config import ConfigError
+
+HELP = """\
+jaxswarm-experiment FIGURE [seeds=N] [scale=1.0] [dir=runs/figures] [out=PATH] [key=value ...]
+jaxswarm-experiment all [dir=runs/figures] [out=benchmarks/results] [key=value ...]
+
+Trains all series of a figure of the thesis as they were trained there, and writes the figure with the curves of the
+thesis behind, a table, and a verdict on each thing that the figure shows. The same command continues after Ctrl-C.
+Figures share run folders where their series are the same. all trains nothing: it reports what has been trained.
+
+  seeds=N          of each series; default: as many as verdicts need
+  scale=0.1        a tenth of the updates; verdicts then say that the runs were cut. A larger scale goes on from there
+  dir=PATH         where the run folders are
+  out=PATH         where figures and report are written; default: dir, and for all benchmarks/results
+  key=value        a key of jaxswarm-train, for every series; runs with other keys are runs of their own
+
+examples
+  jaxswarm-experiment fig_6_1
+  jaxswarm-experiment fig_6_5 seeds=4 scale=0.1
+  jaxswarm-experiment all
+"""
+OPTIONS = ("seeds", "scale", "dir", "out")
+
+
+@program
+def main(arguments: Sequence[str]) -> int:
+    """Trains and reports a figure, or reports all; returns the exit code."""
+    if wants_help(arguments) or not arguments:
+        print(HELP + "\n" + _figures_help())
+        return 0 if arguments else 2
+    name, (options, words) = arguments[0], split(arguments[1:], OPTIONS)
+    if name == "all" and {"seeds", "scale"} & options.keys():
+        raise ConfigError("seeds and scale have no meaning here; all reports what has been trained")
+    directory = Path(options.get("dir", "runs/figures"))
+    out = Path(options.get("out", "benchmarks/results" if name == "all" else directory))
+    try:
+        if name == "all":
+            return _report_all(directory, out, words)
+        num_seeds = whole("seeds", options["seeds"], 1) if "seeds" in options else None
+        return _run(arguments, directory, out, num_seeds, _scale(options.get("scale", "1")), words)
+    except OSError as error:
+        raise ConfigError(f"cannot write to {error.filename}: {error.strerror}") from error
+
+
+def _run(
+    arguments: Sequence[str], directory: Path, out: Path, num_seeds: int | None, scale: float, words: Sequence[str]
+) -> int:
+    from jaxswarm import experiments  # noqa: PLC0415
+
+    figure = experiments.load(arguments[0])
+    trials = experiments.plan(figure, directory, experiments.stored(directory), num_seeds, scale, words)
+    if not _train(trials):
+        print(f"stopped; continue with: {command('jaxswarm-experiment', *arguments)}")
+        return 0
+    section = _section(figure, trials, experiments.stored(directory), out, words)
+    replace_text(out / f"{figure.name}.md", section)
+    print(f"\n{section}\nwrote {out / f'{figure.name}.md'}")
+    return 0
+
+
+def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
+    from jaxswarm import experiments, report  # noqa: PLC0415
+
+    found, sections = experiments.stored(directory), []
+    for figure in map(experiments.load, experiments.names()):
+        sections.append(_section(figure, experiments.plan(figure, directory, found, words=words), found, out, words))
+    replace_text(out / "report.md", report.page(sections))
+    print(f"wrote {out / 'report.md'}")
+    return 0
+
+
+def _section(figure: Any, trials: dict, found: Sequence[Any], out: Path, words: Sequence[str]) -> str:
+    """The figure's part of the report, its pictures drawn."""
+    from jaxswarm import experiments, report  # noqa: PLC0415
+
+    out.mkdir(parents=True, exist_ok=True)
+    measured = experiments.measure(figure, trials, found, lambda text: print(f"warning: {text}", file=sys.stderr))
+    if measured:
+        experiments.draw(figure, measured, out)
+    return report.section(figure, trials, measured, words)
+
+
+def _train(trials: dict) -> bool:
+    """Trains series after series, from where their folders stand; whether all have reached their end."""
+    from jaxswarm import experiments, sweep  # noqa: PLC0415
+
+    use_compile_cache()
+    use_cores(next(iter(trials.values())).settings.num_seeds)
+    for number, (series, trial) in enumerate(trials.items()):
+        steps = trial.num_updates * trial.experiment.agent_steps_per_update
+        print(
+            f"series {number + 1} of {len(trials)}: {series}, seeds: {trial.settings.num_seeds}, {steps:,} agent steps"
+        )
+        print(f"  {trial.run_dir}", flush=True)
+        if not experiments.is_finished(trial) and not sweep.train([trial])[0]:
+            return False
+    return True
+
+
+def _scale(text: str) -> float:
+    try:
+        scale = float(text)
+    except ValueError:
+        scale = 0.0
+    if not 0 < scale <= 1:
+        raise ConfigError(f"scale = {text} is not possible; accepted: numbers above 0, up to 1")
+    return scale
+
+
+def _figures_help() -> str:
+    """Figures with the comment of each file."""
+    from jaxswarm import experiments  # noqa: PLC0415
+
+    lines = ["figures"]
+    for name in experiments.names():
+        with open(configs.config_dir() / configs.FIGURES / f"{name}.yaml", encoding="utf-8") as file:
+            lines.append(f"  {name:<18} {file.readline()[2:].strip()}")
+    return "\n".join(lines)

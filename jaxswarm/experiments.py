@@ -1,0 +1,187 @@
+"""The figures of the thesis: what was run for them, its curves, and what these show.
+
+A figure is a file in `configs/figure`: its series as words for `jaxswarm-train`, and its claims. Series that are the
+same experiment share a run folder, whichever figures they are in.
+"""
+
+import csv
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxswarm import claims, curves, plots, reporting, runs
+from jaxswarm import config as configs
+from jaxswarm.checkpoint import replace_text
+from jaxswarm.claims import Claim, Measured, Verdict
+from jaxswarm.config import Config, ConfigError
+from jaxswarm.curves import Line
+from jaxswarm.plots import Picture, Series
+from jaxswarm.recording import RETURN
+from jaxswarm.runs import RunFolder
+from jaxswarm.sweep import Trial
+
+CURVES = Path(__file__).resolve().parent / "data" / "curves"  # of the thesis
+FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """What a figure's file says, and the curves of the thesis by the names of the series, which may be none."""
+
+    name: str
+    title: str
+    series: Mapping[str, tuple[str, ...]]  # words for `configs.compose`
+    claims: tuple[Claim, ...]
+    references: Mapping[str, Line]
+    num_updates: int  # shown; the thesis trained some series for longer
+    num_seeds: int  # from which on there is a verdict
+    y: tuple[str, ...]  # the pictures, linear and log
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """File names, and logarithmic axes."""
+        return {self.name if scale == "linear" else f"{self.name}_{scale}": "y" * (scale == "log") for scale in self.y}
+
+
+def names() -> list[str]:
+    """All figures, in the order of the thesis."""
+    found = (path.stem for path in (configs.config_dir() / configs.FIGURES).glob("*.yaml"))
+    return sorted(found, key=lambda name: [(not x.isdigit(), int(x) if x.isdigit() else 0, x) for x in name.split("_")])
+
+
+def load(name: str) -> Figure:
+    """The figure of this name; a `ConfigError` lists those that there are."""
+    if name not in names():
+        raise ConfigError(f"{name} is no figure; accepted: all, {', '.join(names())}")
+    fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
+    words, reference = fields.pop("words").split(), fields.pop("reference", None)
+    fields["series"] = {series: (*words, *own.split()) for series, own in fields["series"].items()}
+    fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
+    fields["y"] = tuple(fields.pop("y", ["linear"]))
+    return Figure(name=name, references=_references(CURVES / f"{reference}.csv") if reference else {}, **fields)
+
+
+def stored(directory: Path) -> list[RunFolder]:
+    """All runs in the directory, of any figure."""
+    return [runs.read(path) for path in runs.find([directory])] if any(directory.glob("*/manifest.json")) else []
+
+
+def plan(
+    figure: Figure,
+    directory: Path,
+    found: Sequence[RunFolder] = (),
+    num_seeds: int | None = None,
+    scale: float = 1.0,
+    words: Sequence[str] = (),
+) -> dict[str, Trial]:
+    """The trial of each series, in the folder that was found to have its experiment and seeds, or else in a new one.
+
+    It is `scale` times as long as what the figure shows of it; `words` change all series.
+    """
+    wanted = {
+        series: _cut(figure, [*own, *words], num_seeds or figure.num_seeds, scale)
+        for series, own in figure.series.items()
+    }
+    return {series: _trial(config, directory, found) for series, config in wanted.items()}
+
+
+def is_finished(trial: Trial) -> bool:
+    """Whether its folder has been trained for as long, or longer for another figure."""
+    path = trial.run_dir / "metrics.csv"
+    rows = reporting.read_rows(path) if path.exists() else []
+    return any(row["update"] >= trial.num_updates for row in rows)
+
+
+def measure(
+    figure: Figure, trials: Mapping[str, Trial], found: Sequence[RunFolder], warn: Callable[[str], object]
+) -> dict[str, Measured]:
+    """What all seeds of the figure's series came to that any run holds; series without any are left out.
+
+    As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
+    """
+    measured = {}
+    for series, trial in trials.items():
+        per_update = trial.experiment.agent_steps_per_update
+        fields, end = runs.fields(trial.config), float(figure.num_updates * per_update)
+        same = [folder for folder in found if folder.config == fields]
+        seeds = runs.seeds(same, "agent_steps", RETURN, warn) if any(folder.rows for folder in same) else []
+        if seeds:
+            shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
+            line = _until(curves.summarize(shifted, "median"), end)
+            reference = figure.references.get(series)
+            measured[series] = Measured(line, reference or line, float(reference.x[-1]) if reference else end)
+    return measured
+
+
+def of_thesis(figure: Figure) -> dict[str, Measured]:
+    """The curves of the thesis, measured as ours are."""
+    return {name: Measured(line, line, float(line.x[-1])) for name, line in figure.references.items()}
+
+
+def verdicts(figure: Figure, measured: Mapping[str, Measured]) -> list[Verdict]:
+    """One for each claim."""
+    theirs = of_thesis(figure)
+    return [claims.judge(claim, measured, theirs, figure.num_seeds) for claim in figure.claims]
+
+
+def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
+    """Draws the figure with the curves of the thesis behind ours, and writes the points beside; returns the files."""
+    series = [Series(name, ours.line, f"{ours.line.num_seeds.max()} seeds") for name, ours in measured.items()]
+    for name, line in figure.references.items():
+        series.append(Series(name, line, f"thesis, {line.num_seeds[0]} runs", is_reference=True))
+    caption = "Median and quartiles over seeds" + ("; dashed: the thesis" if figure.references else "")
+    out.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, log in figure.pictures.items():
+        label = "return of an episode"
+        picture = Picture("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
+        plots.draw(out / f"{name}.png", picture)
+        replace_text(out / f"{figure.name}.csv", plots.table(picture))
+        files.append(out / f"{name}.png")
+    return [*files, out / f"{figure.name}.csv"]
+
+
+def _claim(says: str, kind: str, series: Sequence[str], **numbers: int | float) -> Claim:
+    return Claim(says, kind, tuple(series), **{name: float(x) for name, x in numbers.items()})
+
+
+def _references(path: Path) -> dict[str, Line]:
+    with open(path, encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    lines = {}
+    for name in dict.fromkeys(row["series"] for row in rows):
+        columns = ("n_runs", "agent_steps", "median", "q25", "q75")
+        mine = [[float(row[column] or "nan") for column in columns] for row in rows if row["series"] == name]
+        num_runs, x, middle, lower, upper = np.array(mine).T
+        lines[name] = Line(x, middle, lower, upper, num_runs.astype(int))
+    return lines
+
+
+def _cut(figure: Figure, words: Sequence[str], num_seeds: int, scale: float) -> Config:
+    config = configs.compose(words)
+    total = configs.run_settings(config).length(configs.build(config).agent_steps_per_update)
+    num_updates = min(max(1, math.ceil(scale * figure.num_updates - 1e-9)), total)
+    return configs.override(config, [("num_updates", num_updates), ("num_seeds", num_seeds)])
+
+
+def _trial(config: Config, directory: Path, found: Sequence[RunFolder]) -> Trial:
+    fields, seeds = runs.fields(config), configs.run_settings(config).seeds
+    for folder in found:
+        others = configs.run_settings(configs.load(folder.path / "config.yaml")).seeds
+        if folder.config == fields and others == seeds:
+            return Trial(config, configs.build(config), folder.path)
+    parts = "-".join(config[part]["name"] for part in configs.REGISTERED)
+    digest = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:8]
+    return Trial(config, configs.build(config), directory / f"{parts}-{digest}-seeds-{seeds[0]}-{seeds[-1]}")
+
+
+def _until(line: Line, end: float) -> Line:
+    """The part of a line that a figure shows, and at least its first point."""
+    size = max(1, int(np.searchsorted(line.x, end * (1 + 1e-9), side="right")))
+    return Line(line.x[:size], line.y[:size], line.lower[:size], line.upper[:size], line.num_seeds[:size])

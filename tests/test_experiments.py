@@ -1,0 +1,299 @@
+"""Figures of the thesis: their configs against its numbers, claims on made-up curves, and one trained end to end."""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import numpy as np
+import pytest
+
+from jaxswarm import config as configs
+from jaxswarm import experiments, sweep
+from jaxswarm.claims import KINDS, Claim, Measured, judge
+from jaxswarm.cli import experiment as program
+from jaxswarm.config import ConfigError
+from jaxswarm.curves import Line
+
+MEDIUM, SIMPLE = ((120, 60), (160,), "leaky_relu"), ((64,), (64,), "leaky_relu")
+MEAN_OPT, ATTENTIVE = ((174, 226, 96), (97,), "relu"), ((72,), (132, 200), "leaky_relu")
+RENDEZVOUS_OPT = ((146, 120), (19, 177, 162), "tanh")
+CLUSTERING_OPT = ((146, 120), (60, 177, 162), "leaky_relu")
+
+# What was run: agent steps per iteration, batch, iterations; of each series worlds, aggregator, learner, network and
+# number of parameters. Where the thesis's data does not say how many worlds there were, ours have 20.
+RUNS = {
+    "fig_6_1": (164_000, 1000, 160, {
+        "Bayes agg. (medium)": (10, "bayesian", "ppo", MEDIUM, 52_405),
+        "Mean agg. (medium)": (10, "mean", "ppo", MEDIUM, 37_645),
+        "Bayes agg. (simple)": (10, "bayesian", "ppo", SIMPLE, 11_461),
+        "Mean agg. (simple)": (10, "mean", "ppo", SIMPLE, 10_053),
+        "Bayes agg. (opt)": (10, "bayesian", "ppo", RENDEZVOUS_OPT, 143_623),
+        "Mean agg. (opt)": (10, "mean", "ppo", RENDEZVOUS_OPT, 107_863),
+    }),
+    "fig_6_3": (102_000, 10_200, 500, {
+        "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "Mean agg.": (20, "mean", "ppo", MEDIUM, 70_965),
+        "Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 177_885),
+    }),
+    "fig_6_4": (102_000, 1020, 500, {
+        "Bayesian agg.": (20, "bayesian", "ppo", SIMPLE, 19_909),
+        "Mean agg.": (20, "mean", "ppo", SIMPLE, 18_117),
+        "Attentive agg.": (20, "attentive", "ppo", SIMPLE, None),
+    }),
+    "fig_6_5": (102_000, 10_200, 500, {
+        "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "Mean agg.": (20, "mean", "ppo", MEAN_OPT, 286_780),
+        "Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 177_885),
+        "Max Agg.": (10, "mean", "ppo", MEAN_OPT, 286_780),
+    }),
+    "fig_6_8": (256_000, 5120, 200, {
+        "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 102_725),
+        "Mean agg.": (20, "mean", "ppo", MEDIUM, 73_205),
+        "Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 179_517),
+    }),
+    "fig_6_9": (256_000, 10_240, 500, {
+        "Mean agg.": (20, "mean", "ppo", MEDIUM, 108_845),
+        "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 153_125),
+        "Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 241_725),
+    }),
+    "fig_6_10": (102_000, 10_200, 500, {
+        "PPO, Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "PPO, Mean agg.": (20, "mean", "ppo", MEAN_OPT, 286_780),
+        "TRL, Bayesian Agg.": (20, "bayesian", "trl", MEDIUM, 100_485),
+        "TRL, Mean Agg.": (10, "mean", "trl", MEAN_OPT, 286_780),
+    }),
+    "fig_6_11": (102_000, 10_200, 500, {
+        "PPO, Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "PPO, Mean agg.": (20, "mean", "ppo", MEDIUM, 70_965),
+        "TRL, Bayesian agg.": (20, "bayesian", "trl", MEDIUM, 100_485),
+        "TRL, Mean agg.": (20, "mean", "trl", MEDIUM, 70_965),
+    }),
+    "fig_6_12": (256_000, 5120, 200, {
+        "PPO, Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 102_725),
+        "PPO, Mean agg.": (20, "mean", "ppo", MEDIUM, 73_205),
+        "PPO, Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 179_517),
+        "TRL, Bayesian agg.": (20, "bayesian", "trl", MEDIUM, 102_725),
+        "TRL, Mean agg.": (20, "mean", "trl", MEDIUM, 73_205),
+        "TRL, Attentive agg.": (20, "attentive", "trl", ATTENTIVE, 179_517),
+    }),
+    "fig_6_14_pursuit": (102_000, 10_200, 500, {
+        "Bayesian agg. (single space)": (10, "bayesian", "ppo", MEDIUM, 81_045),
+        "Bayesian agg. (sep. spaces)": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "Bayesian agg. (single space, small)": (20, "bayesian", "ppo", SIMPLE, None),
+        "Bayesian agg. (sep. spaces, small)": (20, "bayesian", "ppo", SIMPLE, 19_909),
+    }),
+    "fig_6_14_assembly": (256_000, 5120, 200, {
+        "Bayesian agg. (single space)": (20, "bayesian", "ppo", MEDIUM, 83_285),
+        "Bayesian agg. (sep. spaces)": (20, "bayesian", "ppo", MEDIUM, 102_725),
+    }),
+    "fig_6_15": (102_000, 10_200, 500, {
+        "μ only": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "μ+σ²": (20, "bayesian", "ppo", MEDIUM, 138_885),
+    }),
+    "clustering_3": (1_280_000, 10_240, 500, {
+        "Mean agg. (medium)": (10, "mean", "trl", MEDIUM, None),
+        "Mean agg. (mean-opt)": (10, "mean", "trl", (*MEAN_OPT[:2], "leaky_relu"), None),
+        "Bayesian agg.": (10, "bayesian", "trl", CLUSTERING_OPT, None),
+    }),
+    "fig_max_true": (102_000, 10_200, 500, {
+        "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "Mean agg.": (20, "mean", "ppo", MEAN_OPT, 286_780),
+        "Max Agg.": (20, "max", "ppo", MEDIUM, 70_965),
+    }),
+}  # fmt: skip
+LEARNING = {"learning_rate": 3e-4, "adam_epsilon": 1e-5, "num_epochs": 10, "bootstrap_truncation": False}
+TINY = [
+    *("task.num_agents=3", "task.num_evaders=1", "task.episode_length=5", "num_worlds=2", "num_steps=4"),
+    *("learner.batch_size=12", "eval_worlds=2", "network.encoder=[4]", "network.decoder=[4]"),
+]
+
+
+@functools.cache
+def observation(task):
+    """Its shapes, which take a while for boxes."""
+    return jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
+
+
+@functools.cache
+def compose(words):
+    return configs.compose(words)
+
+
+def num_parameters(experiment, counted={}):  # noqa: B006
+    """Of actor and critic, heads and standard deviation; once for networks that see the same features."""
+    obs, network = observation(experiment.task), experiment.network
+    features = {name: group.features.shape[-1] for name, group in obs.groups.items()}
+    key = (network, obs.own.shape[-1], tuple(sorted(features.items())))
+    if key not in counted:
+        shapes = jax.eval_shape(network.init, jax.random.key(0), obs)
+        counted[key] = sum(math.prod(x.shape) for x in jax.tree.leaves(shapes))
+    return counted[key]
+
+
+def test_every_figure_is_in_the_table():
+    assert RUNS.keys() == set(experiments.names())
+    assert not {configs.FIGURES, configs.SEARCHES} & configs.choices().keys()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_every_series_is_what_was_run(name):
+    per_update, batch_size, num_updates, expected = RUNS[name]
+    figure = experiments.load(name)
+    assert list(figure.series) == list(expected)
+    for series, (num_worlds, aggregator, learner, network, count) in expected.items():
+        config = compose(figure.series[series])
+        run = configs.build(config)
+        assert (config["aggregator"]["name"], config["learner"]["name"]) == (aggregator, learner)
+        assert run.num_worlds * run.num_steps * run.task.num_agents == per_update
+        assert (run.num_worlds, run.learner.batch_size) == (num_worlds, batch_size)
+        assert configs.run_settings(config).length(per_update) == num_updates >= figure.num_updates
+        assert (run.network.encoder, run.network.decoder, run.network.activation) == network
+        assert run.network.latent_space == ("shared" if "single space" in series else "separate")
+        assert {field: getattr(run.learner, field) for field in LEARNING} == LEARNING
+        assert (run.eval_every, run.eval_worlds, run.desynchronised_start) == (1, 20, False)
+        assert count is None or count == num_parameters(run), series
+
+
+def test_tasks_are_those_of_the_thesis():
+    def task(name):
+        return configs.build(compose(next(iter(experiments.load(name).series.values())))).task
+
+    rendezvous, one, several = task("fig_6_1"), task("fig_6_3"), task("fig_6_5")
+    assert (rendezvous.num_agents, rendezvous.torus, rendezvous.relative_velocity) == (20, False, "thesis")
+    assert [(x.num_agents, x.num_evaders, x.reward) for x in (one, several)] == [
+        (10, 1, "distance"),
+        (50, 5, "catches"),
+    ]
+    two, three = task("fig_6_9"), task("clustering_3")
+    assert [(x.num_agents, x.num_boxes, x.reward) for x in (two, three)] == [(10, 4, "amplified"), (20, 12, "corners")]
+    assert task("fig_6_8").episode_length == 512
+
+
+@pytest.mark.parametrize("name", sorted(RUNS.keys() - {"clustering_3"}))
+def test_the_thesis_reproduces_its_own_claims(name):
+    figure = experiments.load(name)
+    assert figure.references.keys() == figure.series.keys()
+    per_update = RUNS[name][0]
+    assert max(line.x[-1] for line in figure.references.values()) == figure.num_updates * per_update
+    theirs = experiments.of_thesis(figure)
+    outcomes = {claim.says: judge(claim, theirs, theirs, enough=1).outcome for claim in figure.claims}
+    assert set(outcomes.values()) == {"reproduced"}, outcomes
+
+
+def test_final_levels_and_steps_are_those_that_the_thesis_was_measured_to_have():
+    pursuit = experiments.of_thesis(experiments.load("fig_6_11"))
+    steps = [pursuit[name].steps_to(0.9) / 1e6 for name in pursuit]
+    np.testing.assert_allclose(steps, [8.0, 7.5, 7.0, 4.7], atol=0.1)
+    several = experiments.of_thesis(experiments.load("fig_6_5"))
+    finals = [several[name].final() for name in ("Bayesian agg.", "Mean agg.", "Attentive agg.", "Max Agg.")]
+    np.testing.assert_allclose(finals, [31.7, 37.7, 20.0, 37.5], atol=0.06)
+
+
+def ramp(final, steps, end=100.0, num_seeds=16):
+    """From 0 in a straight line to a final level at `steps`, with quartiles 2 apart."""
+    x = np.arange(1.0, end + 1)
+    y = final * np.minimum(x / steps, 1)
+    return Line(x, y, y - 1, y + 1, np.full(len(x), num_seeds))
+
+
+def measured(line, end=100.0):
+    return Measured(line, line, end)
+
+
+SERIES = {"a": measured(ramp(10.0, 40.0)), "b": measured(ramp(8.0, 20.0)), "c": measured(ramp(4.0, 80.0))}
+
+
+@pytest.mark.parametrize(
+    ("kind", "series", "fields", "expected"),
+    [
+        ("final", "a", {}, 10.0),
+        ("lower_quartile", "a", {}, 9.0),
+        ("difference", "ac", {}, 6.0),
+        ("spread", "bac", {}, 6.0),
+        ("order", "abc", {}, 2.0),
+        ("order", "acb", {}, -4.0),
+        ("level", "ab", {"at": 20.0}, 5.0),
+        ("lead", "bac", {"at": 10.0}, 1.5),
+        ("steps", "a", {"fraction": 0.51}, 21.0),
+        ("pace", "ca", {"fraction": 0.51}, 2.0),
+    ],
+)
+def test_each_kind_of_claim_is_a_number(kind, series, fields, expected):
+    assert Claim("", kind, tuple(series), **fields).number(SERIES) == pytest.approx(expected, abs=0.15)
+
+
+def test_every_kind_is_in_a_figure():
+    assert {claim.kind for name in RUNS for claim in experiments.load(name).claims} == KINDS.keys()
+
+
+@pytest.mark.parametrize(
+    ("line", "high", "outcome"),
+    [
+        (ramp(10.0, 40.0), 11.0, "reproduced"),
+        (ramp(10.0, 40.0), 9.0, "not reproduced"),
+        (ramp(10.0, 40.0, num_seeds=15), 11.0, "not enough runs"),
+        (ramp(10.0, 40.0, end=90.0), 11.0, "run was cut"),
+    ],
+)
+def test_verdicts_say_what_can_be_said(line, high, outcome):
+    claim = Claim("", "final", ("a",), high=high)
+    verdict = judge(claim, {"a": measured(line)}, SERIES, enough=16)
+    assert (verdict.outcome, verdict.num_seeds) == (outcome, line.num_seeds[0])
+    assert (verdict.here, verdict.thesis) == (pytest.approx(10.0), pytest.approx(10.0))
+    assert judge(claim, {}, SERIES, enough=16).outcome == "not enough runs"
+
+
+def test_a_level_that_is_never_reached_is_no_evidence():
+    low = dataclasses.replace(SERIES["a"], line=ramp(2.0, 40.0))
+    claim = Claim("", "steps", ("a",), fraction=0.9)
+    assert math.isnan(claim.number({"a": low}))
+    assert judge(claim, {"a": low}, SERIES, enough=16).outcome == "not reproduced"
+
+
+def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):
+    first = experiments.plan(experiments.load("fig_6_5"), tmp_path, scale=0.1)["Bayesian agg."]
+    second = experiments.plan(experiments.load("fig_6_15"), tmp_path)["μ only"]
+    assert first.run_dir == second.run_dir
+    assert (first.num_updates, second.num_updates) == (40, 343)
+    assert (first.settings.num_seeds, second.settings.num_seeds) == (16, 16)
+
+
+def test_wrong_words_are_errors(capsys):
+    with pytest.raises(ConfigError, match="fig_6_1, "):
+        experiments.load("fig_9_9")
+    for words, message in [
+        (["fig_9_9"], "is no figure"),
+        (["fig_6_15", "scale=2"], "numbers above 0"),
+        (["fig_6_15", "seeds=0"], "integers from 1"),
+        (["all", "seeds=3"], "no meaning here"),
+    ]:
+        assert program.main(words) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
+    words = ["fig_6_15", "seeds=2", f"dir={tmp_path}", *TINY]
+    real, lengths = sweep.train, []
+
+    def train(trials):
+        lengths.append(trials[0].num_updates)
+        return real(trials)
+
+    monkeypatch.setattr(sweep, "train", train)
+    assert program.main([*words, "scale=0.006"]) == 0
+    assert "run was cut" in capsys.readouterr().out
+    assert program.main([*words, "scale=0.006"]) == 0  # nothing is left to train
+    assert program.main([*words, "scale=0.01"]) == 0  # goes on in the same folders
+    assert lengths == [3, 3, 4, 4]
+    folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}
+    assert len(folders) == 2
+    assert {"fig_6_15.png", "fig_6_15.csv", "fig_6_15.md"} <= {path.name for path in tmp_path.iterdir()}
+    monkeypatch.setattr(experiments, "names", lambda: ["fig_6_5", "fig_6_15"])
+    assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}", *TINY]) == 0
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "| Bayesian agg. | 2 | 0.0 |" in report  # of the other figure
+    assert "| Mean agg. | 0 | not run |" in report
+    assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
+    assert (tmp_path / "out" / "report.md").read_text().count("Not run.") == 2
