@@ -150,8 +150,11 @@ def test_run_settings_are_the_keys_beside_the_experiment():
     run = configs.run_settings(configs.compose(["seed=7", "num_updates=3", "checkpoint_seconds=1"]))
     assert dataclasses.asdict(run) == {
         "seed": 7,
+        "num_seeds": 1,
         "num_updates": 3,
         "total_agent_steps": None,
         "checkpoint_seconds": 1.0,
         "keep_checkpoints": 3,
+        "render_every": None,
+        "loggers": (),
     }
