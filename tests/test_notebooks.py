@@ -87,6 +87,7 @@ def test_links_between_notebooks_lead_somewhere(name):
 def test_notebooks_run(name, tmp_path, monkeypatch):
     client = pytest.importorskip("nbclient")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    monkeypatch.setenv("JAX_NUMPY_RANK_PROMOTION", "raise")  # as in all tests
     monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")  # what takes time here is compiling
     notebook = read(name)
     cell = parameters(notebook)
@@ -94,7 +95,9 @@ def test_notebooks_run(name, tmp_path, monkeypatch):
     client.NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
     ).execute()
-    results = [output for cell in code_cells(notebook) for output in cell.outputs if "data" in output]
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
+    assert "Warning" not in "".join(map(str, outputs))
+    results = [output for output in outputs if "data" in output]
     assert any("image/png" in output.data for output in results)
     if name in ("quickstart", "write_a_task", "swarm_size"):
         assert any("iframe" in output.data.get("text/html", "") for output in results)
