@@ -108,3 +108,12 @@ def test_silent_progress_says_nothing(capsys):
     with reporting.Progress(0, 2, 500, is_shown=False) as progress:
         progress.advance(2, 1.0)
     assert capsys.readouterr().out == ""
+
+
+def test_notebooks_without_widgets_get_lines(capsys, monkeypatch):
+    """There, rich would warn and draw a bar that does not move."""
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with reporting.Progress(0, 2, 500) as progress:
+        progress.advance(2, 1.0)
+    assert capsys.readouterr().out.splitlines()[-1].startswith("update 2/2 · return 1.0")
