@@ -2,6 +2,7 @@
 
 import csv
 import importlib.metadata
+import importlib.util
 import io
 import json
 import math
@@ -195,7 +196,8 @@ class Progress:
         from rich import console, progress  # noqa: PLC0415
 
         screen = console.Console()
-        if not (screen.is_terminal or screen.is_jupyter):
+        is_bare = screen.is_jupyter and importlib.util.find_spec("ipywidgets") is None  # a bar would warn, and not move
+        if is_bare or not (screen.is_terminal or screen.is_jupyter):
             return None
         columns = (
             progress.TextColumn("update {task.completed}/{task.total}"),

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import html
 import json
 import re
 import shutil
@@ -126,6 +127,14 @@ def test_a_page_asks_for_nothing_from_outside():
     text = page.html([episode()])
     assert not re.findall(r"(?:src|href)\s*=\s*[\"'](?!data:)|https?://|@import|fetch\(|localStorage", text)
     assert text.count("</script>") == 4  # titles cannot end a script
+
+
+def test_a_page_inside_of_a_notebook_is_the_page():
+    films = [episode()]
+    text = render.iframe(films, height=500)
+    (source,) = re.findall(r'srcdoc="([^"]*)"', text)
+    assert html.unescape(source) == page.html(films)
+    assert 'height="500"' in text
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -75,7 +75,7 @@ def test_the_curve_of_several_seeds_shows_their_median(tmp_path):
 def test_the_manifest_has_versions_device_and_the_arithmetic_of_steps(tmp_path):
     experiment = config.build(config.compose(["experiment=rendezvous_thesis"]))
     path = tmp_path / "manifest.json"
-    reporting.write_manifest(path, reporting.manifest(experiment, 160, seed=4))
+    reporting.write_manifest(path, reporting.manifest(experiment, 160, [4]))
     manifest = json.loads(path.read_text())
     assert manifest["seeds"] == [4]
     assert manifest["versions"]["jaxlib"] == jaxlib.__version__
@@ -108,3 +108,12 @@ def test_silent_progress_says_nothing(capsys):
     with reporting.Progress(0, 2, 500, is_shown=False) as progress:
         progress.advance(2, 1.0)
     assert capsys.readouterr().out == ""
+
+
+def test_notebooks_without_widgets_get_lines(capsys, monkeypatch):
+    """There, rich would warn and draw a bar that does not move."""
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with reporting.Progress(0, 2, 500) as progress:
+        progress.advance(2, 1.0)
+    assert capsys.readouterr().out.splitlines()[-1].startswith("update 2/2 · return 1.0")

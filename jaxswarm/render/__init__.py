@@ -1,5 +1,6 @@
 """Pictures of policies at work: one offline page, a strip, a moving picture. Viewers know scenes, not tasks."""
 
+import html
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ __all__ = [
     "check",
     "describe",
     "hook",
+    "iframe",
     "of_seed",
     "record",
     "write",
@@ -63,6 +65,12 @@ def write(path: Path, films: Sequence[Film], **options: int) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def iframe(films: Sequence[Film], *, height: int = 760) -> str:
+    """The page inside of HTML, for notebooks: `IPython.display.HTML(iframe(films))`; `height` in pixels."""
+    style = "width: 100%; max-width: 1000px; border: 0"
+    return f'<div><iframe srcdoc="{html.escape(page.html(films))}" height="{height}" style="{style}"></iframe></div>'
 
 
 def describe(task: Any) -> str:
