@@ -152,6 +152,7 @@ def random_state(task):
     )
 
 
+@pytest.mark.slow
 def test_the_order_of_robots_and_boxes_does_not_matter():
     task = Assembly(num_agents=5)
     state = random_state(task)
@@ -233,6 +234,7 @@ def test_one_hot_identity_says_what_groups_say():
     np.testing.assert_array_equal(boxes.features[0, :, 7:], [[1, 0], [1, 0], [0, 1], [0, 1]])
 
 
+@pytest.mark.slow
 def test_the_number_of_boxes_varies_evenly_over_clusters(monkeypatch):
     monkeypatch.setattr(rigid2d, "settle", lambda solver, side, state, substeps: state)  # this is not about physics
     task = Clustering(num_agents=2, num_boxes=6, num_clusters=3, active_boxes=(2, 6))

@@ -42,6 +42,7 @@ def three_seeds(tmp_path_factory):
     return *fit(EXPERIMENT, 10, seed=5, num_seeds=3, run_dir=run_dir, **OPTIONS), run_dir
 
 
+@pytest.mark.slow
 def test_each_seed_is_the_single_run_of_that_seed_bit_by_bit(three_seeds):
     states, rows, _ = three_seeds
     for index, seed in ((0, 5), (2, 7)):
@@ -51,6 +52,7 @@ def test_each_seed_is_the_single_run_of_that_seed_bit_by_bit(three_seeds):
         assert returns == [row["eval/return"] for row in alone_rows]
 
 
+@pytest.mark.slow
 def test_rows_keep_seeds_apart(three_seeds):
     _, rows, run_dir = three_seeds
     assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 6, 9, 10) for s in (5, 6, 7)]
@@ -59,6 +61,7 @@ def test_rows_keep_seeds_apart(three_seeds):
     assert json.loads((run_dir / "manifest.json").read_text())["seeds"] == [5, 6, 7]
 
 
+@pytest.mark.slow
 def test_several_seeds_resume_to_the_same_end(three_seeds, tmp_path):
     states, _, run_dir = three_seeds
     fit(EXPERIMENT, 4, seed=5, num_seeds=3, run_dir=tmp_path / "run", **OPTIONS)
@@ -120,6 +123,7 @@ def test_runs_of_several_experiments_resume_together(with_a_diverging_run, tmp_p
     assert [row["update"] for row in good if row["seed"] == 6] == [0, 3, 6, 9, 10]
 
 
+@pytest.mark.slow
 def test_when_all_seeds_diverge_training_stops():
     with pytest.raises(DivergedError, match="training stopped"):
         fit(DIVERGING, 10, num_seeds=2, progress=False)

@@ -136,7 +136,9 @@ def test_every_figure_is_in_the_table():
     assert not {configs.FIGURES, configs.SEARCHES} & configs.choices().keys()
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "fig_6_1" else pytest.mark.slow) for name in RUNS]
+)
 def test_every_series_is_what_was_run(name):
     per_update, batch_size, num_updates, expected = RUNS[name]
     figure = experiments.load(name)

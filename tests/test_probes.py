@@ -27,26 +27,31 @@ def outputs(request):
     return output
 
 
+@pytest.mark.slow
 def test_value_of_a_constant_reward(outputs):
     assert outputs("constant reward", 1, 0)[1] == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cue", [-1, 1])
 def test_value_that_depends_on_the_observation(outputs, cue):
     assert outputs("reward that depends on the observation", cue, 0)[1] == pytest.approx(cue, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("time", "value"), [(0, OPTIONS["discount"]), (1, 1.0)])
 def test_value_of_a_delayed_reward_is_discounted(outputs, time, value):
     assert outputs("delayed reward", 1, time)[1] == pytest.approx(value, abs=0.1)
 
 
+@pytest.mark.slow
 def test_best_action(outputs):
     assert outputs("reward that depends on the action", 1, 0)[0] == pytest.approx(0.5, abs=0.15)
     returns = outputs.returns["reward that depends on the action"]
     assert returns[20] > returns[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cue", [-1, 1])
 def test_best_action_that_depends_on_the_observation(outputs, cue):
     assert outputs("reward that depends on both", cue, 0)[0] == pytest.approx(cue / 2, abs=0.15)

@@ -348,6 +348,7 @@ def settled():
     return starts, settle(jnp.float32(1.0), starts)
 
 
+@pytest.mark.slow
 def test_settling_parts_whatever_overlaps():
     starts, states = settled()
     before, after = overlaps(starts, 1.0), overlaps(states, 1.0)
@@ -378,6 +379,7 @@ def test_odd_states_stay_finite_and_come_apart(discs, boxes):
 SIZES = [(1, 1), (0, 1), (1, 0), (2, 0), (0, 2), (3, 1), (1, 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("num_discs", "num_boxes"), [SIZES[0], *[pytest.param(*s, marks=pytest.mark.slow) for s in SIZES[1:]]]
 )

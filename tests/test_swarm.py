@@ -96,6 +96,7 @@ def test_lists_of_all_neighbours_change_nothing(name, torus, radius):
     assert_same_sight(expected_obs, obs, ROOM)
 
 
+@pytest.mark.slow
 @every_swarm
 def test_neighbours_without_room_are_reported(name):
     task = crowded(name, max_neighbors=2)
@@ -105,6 +106,7 @@ def test_neighbours_without_room_are_reported(name):
     np.testing.assert_allclose(obs.own[:, 0], 1)  # all are counted
 
 
+@pytest.mark.slow
 @every_swarm
 def test_numbers_of_agents_are_drawn_between_their_bounds(name):
     task = crowded(name, active_agents=(3, 5))

@@ -94,6 +94,7 @@ parameters:
 """
 
 
+@pytest.mark.slow
 def test_the_space_of_the_thesis_gives_configs_for_each_aggregator():
     optuna = pytest.importorskip("optuna")
     for name in ("mean", "bayesian", "attentive"):

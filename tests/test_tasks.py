@@ -202,6 +202,7 @@ def slope(task, position, offset):
     return jax.grad(total)(offset)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.0, 1e-20, 1e-3])
 @pytest.mark.parametrize("corner", [0.0, 1.0])
 def test_gradients_are_finite_even_between_agents_at_one_place(task, distance, corner):

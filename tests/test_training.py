@@ -33,6 +33,7 @@ def assert_same_bits(one, two):
     jax.tree.map(check, one, two)
 
 
+@pytest.mark.slow
 def test_single_updates_and_one_call_give_the_same_bits(run):
     state, expected, expected_metrics = run
     rows = []
@@ -56,6 +57,7 @@ def test_chunks_of_any_length_share_one_program_and_give_the_same_bits(run):
     assert all(np.isnan(x[2]) for x in second.values())
 
 
+@pytest.mark.slow
 def test_evaluations_are_due_before_every_second_update(run):
     _, _, metrics = run
     assert metrics.keys() >= {"eval/return", "eval/distance", "train/return", "learner/approx_kl"}
@@ -69,6 +71,7 @@ def test_evaluation_does_not_change_training(run):
     assert_same_bits(jaxswarm.train(without, state, 5)[0], expected)
 
 
+@pytest.mark.slow
 def test_the_program_evaluates_as_the_function_does(run):
     state, _, metrics = run
     for name, value in jax.jit(jaxswarm.evaluate)(EXPERIMENT, state).items():
@@ -136,6 +139,7 @@ def test_desynchronised_worlds_start_at_random_times():
     np.testing.assert_array_equal(init(experiment, jax.random.key(0)).worlds.state.time, 0)
 
 
+@pytest.mark.slow
 def test_train_traces_once_for_many_calls(run):
     state, _, _ = run
     before = jaxswarm.train._cache_size()

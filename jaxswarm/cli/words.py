@@ -1,5 +1,6 @@
 """What the programs of the command line have in common: words in, exit codes and one line for every mistake out."""
 
+import contextlib
 import functools
 import gc
 import os
@@ -113,7 +114,8 @@ def use_cores(num_runs: int) -> None:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     is_decided = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if not is_decided and "JAX_COORDINATOR_ADDRESS" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
+        with contextlib.suppress(RuntimeError):  # called by a program that uses devices already
+            jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
 
 
 def resume_command(run_dir: Path) -> str:
