@@ -205,7 +205,7 @@ def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(cache, tmp_pat
         process = start(f"resume={run_dir}")
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, (out, err)
-    compiled = list(Path(os.environ["XDG_CACHE_HOME"], "jaxswarm", "xla").glob("jit_train_chunk*-cache"))
+    compiled = list(Path(os.environ["XDG_CACHE_HOME"], "jaxswarm", "xla").glob("jit__advance*-cache"))
     assert compiled
     assert table(run_dir) == table(undisturbed)
     template = abstract_state(configs.build(configs.load(run_dir / "config.yaml")))
