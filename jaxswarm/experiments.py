@@ -22,7 +22,7 @@ from jaxswarm.claims import Claim, Measured, Verdict
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.curves import Line
 from jaxswarm.plots import Picture, Series
-from jaxswarm.recording import RETURN
+from jaxswarm.reporting import RETURN
 from jaxswarm.runs import RunFolder
 from jaxswarm.sweep import Trial
 

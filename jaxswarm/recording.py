@@ -11,10 +11,8 @@ import numpy as np
 from jaxswarm import reporting
 from jaxswarm.checkpoint import Checkpoints, Restored
 from jaxswarm.loggers import LOGGERS, Logger
-from jaxswarm.reporting import Row
+from jaxswarm.reporting import RETURN, Row
 from jaxswarm.training import Experiment, TrainState, is_loss
-
-RETURN = "eval/return"
 
 
 @dataclasses.dataclass(frozen=True)

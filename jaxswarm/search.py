@@ -14,8 +14,7 @@ import numpy as np
 from jaxswarm import config as configs
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.learners.on_policy import nearest_batch_sizes
-from jaxswarm.recording import RETURN
-from jaxswarm.reporting import Row
+from jaxswarm.reporting import RETURN, Row
 
 if TYPE_CHECKING:
     import optuna

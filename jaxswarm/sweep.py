@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import io
-import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,8 +16,8 @@ from jaxswarm import runs as folders
 from jaxswarm.checkpoint import replace_text
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.fit import DivergedError, fit_runs
-from jaxswarm.recording import RETURN, Run
-from jaxswarm.reporting import Row
+from jaxswarm.recording import Run
+from jaxswarm.reporting import RETURN, Row
 from jaxswarm.training import Experiment
 
 RANGE = re.compile(r"(?P<low>[^,]+?)\.\.(?P<high>[^,:]+):(?P<count>\d+) ?(?P<log>log)?$")
@@ -144,4 +143,4 @@ def _listed(word: str) -> str:
     numbers = np.geomspace(low, high, count) if found["log"] else np.linspace(low, high, count)
     is_whole = all(float(x).is_integer() for x in (low, high)) and all(abs(x - round(x)) < 1e-9 for x in numbers)
     texts = (str(round(x)) if is_whole and "." not in found["low"] + found["high"] else f"{x:.6g}" for x in numbers)
-    return f"{key}={','.join(dict.fromkeys(itertools.chain(texts)))}"
+    return f"{key}={','.join(dict.fromkeys(texts))}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxswarm import curves, plots, runs
 from jaxswarm.checkpoint import replace_text
-from jaxswarm.cli.words import program, wants_help, whole
+from jaxswarm.cli.words import program, split, wants_help, whole
 from jaxswarm.config import ConfigError
 from jaxswarm.curves import STATISTICS, Curve, Line
 from jaxswarm.plots import Picture, Series
@@ -109,21 +109,15 @@ def main(arguments: Sequence[str]) -> int:
 def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
     """Options, and paths; what exists is a path, whatever is in its name."""
     names = [field.name for field in dataclasses.fields(Options)]
-    options, paths = {}, []
-    for word in arguments:
-        name, equals, value = word.partition("=")
-        if equals and name in names:
-            if not value:
-                raise ConfigError(f"{name} has no value")
-            options[name] = value
-        elif equals and not Path(word).exists():
+    options, words = split(arguments, names)
+    for word in words:
+        name, equals, _ = word.partition("=")
+        if equals and not Path(word).exists():
             near = "".join(f"did you mean {x!r}? " for x in difflib.get_close_matches(name, names, n=1))
             raise ConfigError(f"unknown key {name!r}; {near}accepted: {', '.join(names)}")
-        else:
-            paths.append(Path(word))
-    if not paths:
+    if not words:
         raise ConfigError("give a run folder, or a folder that holds some: jaxswarm-plot PATH... [key=value ...]")
-    return Options(**options), paths
+    return Options(**options), [Path(word) for word in words]
 
 
 def _output(out: str) -> Path:
