@@ -2,12 +2,17 @@
 
 Contacts of one kind form `Rows`, dense arrays over all pairs: to compute all pairs of a few bodies is cheaper than to
 select those that touch. Worlds, any number of them, are the last axes: [..., *worlds].
+
+Bodies of two kinds meet in a table, with a row for each other body. Those of one kind stand in a circle, and row k pairs
+each with the one that is k + 1 places ahead: half a table holds every pair once, but for the last row of an even number,
+which has each twice.
 """
 
 import dataclasses
 import functools
 import math
 import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -111,18 +116,16 @@ class Pose:
 class Rows:
     """Directions in which pairs of bodies push each other, at some points each; walls are bodies that do not move.
 
-    `x, y` is the unit vector along which the own body is pushed; an arm is the torque of a unit force. `is_mutual` rows
-    list each pair once, and push the other body, too; else each pair is there twice, or the other is a wall.
+    `x, y` is the unit vector along which the own body is pushed; an arm is the torque of a unit force.
     """
 
-    x: Float[Array, "points other own *worlds"]
-    y: Float[Array, "points other own *worlds"]
-    own_arm: Float[Array, "points other own *worlds"] | None
-    other_arm: Float[Array, "points other own *worlds"] | None
-    near: Float[Array, "points other own *worlds"]  # 1 in contact, else 0
+    x: Float[Array, "points row own *worlds"]
+    y: Float[Array, "points row own *worlds"]
+    own_arm: Float[Array, "points row own *worlds"] | None
+    other_arm: Float[Array, "points row own *worlds"] | None
+    near: Float[Array, "points row own *worlds"]  # 1 in contact, else 0
     own: str = static()
     other: str = static()
-    is_mutual: bool = static(default=False)
     mass: Any = None  # once `weighted`: effective mass in contact, else 0; like the others
 
     def weighted(self, solver: Solver) -> "Rows":
@@ -132,26 +135,42 @@ class Rows:
             linear, angular = _inverse_mass(kind, solver)
             return linear if arm is None else linear + angular * arm**2
 
-        total = of_own(jnp.maximum(_sum(self.near, 1), 1)) * mobility(self.own, self.own_arm)
+        count = {self.own: _by_own(self.near)}
         if self.other != "wall":
-            total = total + of_other(jnp.maximum(_sum(self.near, 2), 1)) * mobility(self.other, self.other_arm)
+            count[self.other] = self._by_other(self.near) + count.get(self.other, 0.0)
+        count = {kind: jnp.maximum(number, 1) for kind, number in count.items()}
+        total = of_own(count[self.own]) * mobility(self.own, self.own_arm)
+        if self.other != "wall":
+            total = total + self._of_other(count[self.other]) * mobility(self.other, self.other_arm)
         return dataclasses.replace(self, mass=self.near / total)
 
-    def velocity(self, motions: Motions) -> Float[Array, "points other own *worlds"]:
+    def velocity(self, motions: Motions) -> Float[Array, "points row own *worlds"]:
         """At which pairs separate."""
         result = _along(self.x, self.y, self.own_arm, of_own(motions[self.own]))
         if self.other != "wall":
-            result = result - _along(self.x, self.y, self.other_arm, of_other(motions[self.other]))
+            result = result - _along(self.x, self.y, self.other_arm, self._of_other(motions[self.other]))
         return result
 
-    def push(self, motions: Motions, impulse: Float[Array, "points other own *worlds"], solver: Solver) -> Motions:
+    def push(self, motions: Motions, impulse: Float[Array, "points row own *worlds"], solver: Solver) -> Motions:
         """The motions after these impulses."""
         x, y = impulse * self.x, impulse * self.y
-        kicked = {self.own: _kick(motions[self.own], self.own, x, y, _times(impulse, self.own_arm), 1, solver)}
-        if self.is_mutual:
-            torque = _times(-impulse, self.other_arm)
-            kicked[self.other] = _kick(motions[self.other], self.other, -x, -y, torque, 2, solver)
-        return motions | kicked
+
+        def kick(kind: str, arm: Array | None, sign: int, total: Callable[[Array], Array]) -> Motion:
+            motion, (linear, angular) = motions[kind], _inverse_mass(kind, solver)
+            turn = None if arm is None else motion.turn + sign * angular * total(impulse * arm)
+            return Motion(motion.x + sign * linear * total(x), motion.y + sign * linear * total(y), turn)
+
+        motions = motions | {self.own: kick(self.own, self.own_arm, 1, _by_own)}
+        if self.other != "wall":
+            motions = motions | {self.other: kick(self.other, self.other_arm, -1, self._by_other)}
+        return motions
+
+    def _of_other(self, bodies: Any) -> Any:
+        return ahead(bodies) if self.own == self.other else of_other(bodies)
+
+    def _by_other(self, rows: Array) -> Array:
+        rows = _sum(rows, 0)
+        return _sum(_behind(rows), 0) if self.own == self.other else _sum(rows, 1)
 
 
 def of_own(bodies: Any) -> Any:
@@ -164,8 +183,23 @@ def of_other(bodies: Any) -> Any:
     return jax.tree.map(lambda v: v[None, :, None], bodies)
 
 
-def _times(impulse: Array, arm: Array | None) -> Array | None:
-    return None if arm is None else impulse * arm
+def ahead(bodies: Any) -> Any:
+    """Arrays [bodies, *worlds] as those of the other body of each pair in a circle."""
+
+    def shifted(v: Array) -> Array:
+        size, num_rows = v.shape[0], v.shape[0] // 2
+        laps = jnp.broadcast_to(v, (num_rows + 2, *v.shape)).reshape(-1, *v.shape[1:])  # row k is to begin at k + 1
+        return laps[1 : 1 + num_rows * (size + 1)].reshape(1, num_rows, size + 1, *v.shape[1:])[:, :, :size]
+
+    return jax.tree.map(shifted, bodies)
+
+
+def _behind(rows: Float[Array, "row own *worlds"]) -> Float[Array, "row other *worlds"]:
+    """Numbers of the pairs in a circle, by their other body."""
+    num_rows, size, *worlds = rows.shape
+    laps = jnp.concatenate([rows, rows], 1).reshape(-1, *worlds)
+    laps = jnp.pad(laps[size - 1 :], [(0, size - 1 - num_rows)] + [(0, 0)] * len(worlds))
+    return laps.reshape(num_rows, 2 * size - 1, *worlds)[:, :size]
 
 
 def _along(x: Array, y: Array, arm: Array | None, motion: Motion) -> Array:
@@ -178,25 +212,18 @@ def _inverse_mass(kind: str, solver: Solver) -> tuple[float, float]:
     return (1 / solver.disc_mass, 0.0) if kind == "disc" else (1 / BOX_MASS, 1 / BOX_INERTIA)
 
 
-def _kick(motion: Motion, kind: str, x: Array, y: Array, torque: Array | None, axis: int, solver: Solver) -> Motion:
-    linear, angular = _inverse_mass(kind, solver)
-    turn = None if torque is None else motion.turn + angular * _sum(torque, axis)
-    return Motion(motion.x + linear * _sum(x, axis), motion.y + linear * _sum(y, axis), turn)
+def _by_own(rows: Float[Array, "points row own *worlds"]) -> Float[Array, "own *worlds"]:
+    return _sum(rows.reshape(-1, *rows.shape[2:]), 0)
 
 
-def _sum(rows: Float[Array, "points other own *worlds"], axis: int) -> Float[Array, "bodies *worlds"]:
-    """Over all points and, with axis 1, all others of each body, or with axis 2, all own ones.
+def _sum(rows: Array, axis: int) -> Array:
+    """Over an axis.
 
     XLA on a CPU does not vectorise loops over a few leading rows; written out they take a third of the time.
     """
-    num_points, num_rows = rows.shape[0], rows.shape[axis]
-    if not 0 < num_points * num_rows <= 16:
-        return rows.sum((0, axis))
-    terms = [
-        jax.lax.index_in_dim(rows[point], row, axis - 1, False)
-        for point in range(num_points)
-        for row in range(num_rows)
-    ]
+    if not 0 < rows.shape[axis] <= 16:
+        return rows.sum(axis)
+    terms = [jax.lax.index_in_dim(rows, i, axis, False) for i in range(rows.shape[axis])]
     return functools.reduce(operator.add, terms)
 
 
@@ -208,8 +235,8 @@ class Contact:
     """
 
     normal: Rows
-    gap: Float[Array, "points other own *worlds"]  # in metres, negative where bodies overlap
-    bias: Float[Array, "points other own *worlds"]  # m / s, by which a pair may close; negative where it has to part
+    gap: Float[Array, "points row own *worlds"]  # in metres, negative where bodies overlap
+    bias: Float[Array, "points row own *worlds"]  # m / s, by which a pair may close; negative where it has to part
     tangent: Rows | None = None
     friction: float = static(default=0.0)
 

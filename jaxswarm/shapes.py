@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, Contact, Motion, Pose, Rows, Solver, of_other, of_own
+from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, Contact, Motion, Pose, Rows, Solver, ahead, of_other, of_own
 
 _HALF = BOX_SIDE / 2
 
@@ -44,24 +44,32 @@ def no_impulses(disc: Float[Array, "discs *worlds"], box: Float[Array, "boxes *w
     """Zeros for all contacts; made of coordinates of bodies, so that worlds may be spread over devices."""
     walls, points = np.zeros((1, 2, 1)), np.zeros((2, 1, 1))
     return {
-        "disc_disc": 0 * (of_own(disc) + of_other(disc)),
+        "disc_disc": 0 * ahead(disc),
         "disc_box": 0 * (of_own(disc) + of_other(box)),
-        "box_box": 0 * (of_own(box) + of_other(box)) + _table(points, box),
+        "box_box": 0 * ahead(box) + _table(points, box),
         "box_wall": 0 * of_own(box) + _table(points + walls, box),
     }
 
 
 def _disc_disc(solver: Solver, disc: Pose) -> Contact:
-    index = np.arange(disc.x.shape[0])
-    order = _table(np.sign(index - index[:, None])[None], disc.x)
-    x = of_own(disc.x) - of_other(disc.x) + 1e-9 * order  # discs at one place part, too
-    y = of_own(disc.y) - of_other(disc.y)
+    own, other = of_own(disc), ahead(disc)
+    is_pair, is_first = _pairs(disc.x)
+    x = own.x - other.x + 1e-9 * jnp.where(is_first, 1.0, -1.0)  # discs at one place part, too
+    y = own.y - other.y
     squared = jnp.maximum(x**2 + y**2, 1e-18)
     inverse = jax.lax.rsqrt(squared)
     gap = squared * inverse - (2 * DISC_RADIUS + solver.offsets.disc_disc)
-    near = (gap < solver.margin) * jnp.abs(order)
+    near = (gap < solver.margin) * is_pair
     rows = Rows(x * inverse, y * inverse, None, None, near, own="disc", other="disc")
     return Contact(rows, gap, _bias(solver, gap, solver.recovery))
+
+
+def _pairs(like: Float[Array, "bodies *worlds"]) -> tuple[Array, Array]:
+    """In a circle of bodies, 1 for pairs that are there for the first time, and whether the own body is the first."""
+    size = like.shape[0]
+    row, own = np.indices((size // 2, size))
+    is_repeated = (2 * (row + 1) == size) & (own >= size // 2)
+    return _table(~is_repeated[None], like), _table((own + row + 1 < size)[None], like) > 0
 
 
 def _table(values: np.ndarray, like: Array) -> Array:
@@ -90,7 +98,7 @@ def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
     arm = jnp.clip(x, -_HALF, _HALF) * local_y - jnp.clip(y, -_HALF, _HALF) * local_x
     near = (gap < solver.margin) * of_other(present)
     normal = box.cos * local_x - box.sin * local_y, box.sin * local_x + box.cos * local_y
-    rows = Rows(*normal, None, arm, near, own="disc", other="box", is_mutual=True)
+    rows = Rows(*normal, None, arm, near, own="disc", other="box")
     return Contact(rows, gap, _bias(solver, gap, solver.recovery))
 
 
@@ -101,9 +109,8 @@ def _box_box(solver: Solver, box: Pose, present: Array) -> Contact:
     axes, u along the normal of that face and t along the face, the other box is at (u, t), turned by an angle that
     equal squares allow to reduce to a turn of at most 45 degrees either way.
     """
-    index = np.arange(box.x.shape[0])
-    is_first = _table(index[None] < index[:, None], box.x)[None] > 0
-    own, other = of_own(box), of_other(box)
+    is_pair, is_first = _pairs(box.x)
+    own, other = of_own(box), ahead(box)
     dx, dy = other.x - own.x, other.y - own.y
 
     def separation(pose: Pose) -> Array:
@@ -118,7 +125,7 @@ def _box_box(solver: Solver, box: Pose, present: Array) -> Contact:
     point_t = jnp.clip(edge_t + end * turn_cos, -_HALF, _HALF)
     point_u = edge_u - (point_t - edge_t) * (turn_sin / turn_cos)
     gap = point_u - _HALF - solver.offsets.box_box
-    is_pair = _table(1 - np.eye(len(index))[None], box.x) * of_own(present) * of_other(present)
+    is_pair = is_pair * of_own(present) * ahead(present)
     near = (gap < solver.margin) * is_pair
     own_t, other_t = (sign * jnp.where(x, point_t, point_t - t) for x in (is_own, ~is_own))
     normal = Rows(-sign * face_x, -sign * face_y, own_t, other_t, near, own="box", other="box")
