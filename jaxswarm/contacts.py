@@ -128,21 +128,22 @@ class Rows:
     other: str = static()
     mass: Any = None  # once `weighted`: effective mass in contact, else 0; like the others
 
-    def weighted(self, solver: Solver) -> "Rows":
-        """With masses 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)), n the number of contacts of a body."""
+    def masses(self, solver: Solver) -> Float[Array, "points row own *worlds"]:
+        """In contact 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)), n the number of contacts of a body; else 0."""
 
         def mobility(kind: str, arm: Array | None) -> Array | float:
             linear, angular = _inverse_mass(kind, solver)
             return linear if arm is None else linear + angular * arm**2
 
-        count = {self.own: _by_own(self.near)}
+        near = total(self.near, 0)
+        count = {self.own: total(near, 0)}
         if self.other != "wall":
-            count[self.other] = self._by_other(self.near) + count.get(self.other, 0.0)
+            count[self.other] = self._by_other(near) + count.get(self.other, 0.0)
         count = {kind: jnp.maximum(number, 1) for kind, number in count.items()}
-        total = of_own(count[self.own]) * mobility(self.own, self.own_arm)
+        inverse = of_own(count[self.own]) * mobility(self.own, self.own_arm)
         if self.other != "wall":
-            total = total + self._of_other(count[self.other]) * mobility(self.other, self.other_arm)
-        return dataclasses.replace(self, mass=self.near / total)
+            inverse = inverse + self._of_other(count[self.other]) * mobility(self.other, self.other_arm)
+        return self.near / inverse
 
     def velocity(self, motions: Motions) -> Float[Array, "points row own *worlds"]:
         """At which pairs separate."""
@@ -151,26 +152,44 @@ class Rows:
             result = result - _along(self.x, self.y, self.other_arm, self._of_other(motions[self.other]))
         return result
 
-    def push(self, motions: Motions, impulse: Float[Array, "points row own *worlds"], solver: Solver) -> Motions:
+    def force(self, impulse: Float[Array, "points row own *worlds"]) -> "Force":
+        """What these impulses do to the pairs."""
+        terms = impulse * self.x, impulse * self.y, _times(impulse, self.own_arm), _times(impulse, self.other_arm)
+        return Force(*(term if term is None else total(term, 0) for term in terms))
+
+    def push(self, solver: Solver, motions: Motions, force: "Force") -> Motions:
         """The motions after these impulses."""
-        x, y = impulse * self.x, impulse * self.y
 
-        def kick(kind: str, arm: Array | None, sign: int, total: Callable[[Array], Array]) -> Motion:
+        def kick(kind: str, torque: Array | None, sign: int, by_body: Callable[[Array], Array]) -> Motion:
             motion, (linear, angular) = motions[kind], _inverse_mass(kind, solver)
-            turn = None if arm is None else motion.turn + sign * angular * total(impulse * arm)
-            return Motion(motion.x + sign * linear * total(x), motion.y + sign * linear * total(y), turn)
+            turn = None if torque is None else motion.turn + sign * angular * by_body(torque)
+            return Motion(
+                motion.x + sign * linear * by_body(force.x), motion.y + sign * linear * by_body(force.y), turn
+            )
 
-        motions = motions | {self.own: kick(self.own, self.own_arm, 1, _by_own)}
+        motions = motions | {self.own: kick(self.own, force.own_torque, 1, lambda rows: total(rows, 0))}
         if self.other != "wall":
-            motions = motions | {self.other: kick(self.other, self.other_arm, -1, self._by_other)}
+            motions = motions | {self.other: kick(self.other, force.other_torque, -1, self._by_other)}
         return motions
 
     def _of_other(self, bodies: Any) -> Any:
         return ahead(bodies) if self.own == self.other else of_other(bodies)
 
-    def _by_other(self, rows: Array) -> Array:
-        rows = _sum(rows, 0)
-        return _sum(_behind(rows), 0) if self.own == self.other else _sum(rows, 1)
+    def _by_other(self, rows: Float[Array, "row own *worlds"]) -> Float[Array, "other *worlds"]:
+        return total(_behind(rows), 0) if self.own == self.other else total(rows, 1)
+
+
+class Force(NamedTuple):
+    """Impulses of pairs, of all their points together."""
+
+    x: Float[Array, "row own *worlds"]
+    y: Float[Array, "row own *worlds"]
+    own_torque: Float[Array, "row own *worlds"] | None
+    other_torque: Float[Array, "row own *worlds"] | None
+
+
+def _times(impulse: Array, arm: Array | None) -> Array | None:
+    return None if arm is None else impulse * arm
 
 
 def of_own(bodies: Any) -> Any:
@@ -212,16 +231,12 @@ def _inverse_mass(kind: str, solver: Solver) -> tuple[float, float]:
     return (1 / solver.disc_mass, 0.0) if kind == "disc" else (1 / BOX_MASS, 1 / BOX_INERTIA)
 
 
-def _by_own(rows: Float[Array, "points row own *worlds"]) -> Float[Array, "own *worlds"]:
-    return _sum(rows.reshape(-1, *rows.shape[2:]), 0)
+def total(rows: Array, axis: int) -> Array:
+    """Sum over an axis.
 
-
-def _sum(rows: Array, axis: int) -> Array:
-    """Over an axis.
-
-    XLA on a CPU does not vectorise loops over a few leading rows; written out they take a third of the time.
+    XLA on a CPU does not vectorise loops over a few leading rows; written out they take a third of the time or less.
     """
-    if not 0 < rows.shape[axis] <= 16:
+    if not 0 < rows.shape[axis] <= 32:
         return rows.sum(axis)
     terms = [jax.lax.index_in_dim(rows, i, axis, False) for i in range(rows.shape[axis])]
     return functools.reduce(operator.add, terms)
@@ -240,10 +255,14 @@ class Contact:
     tangent: Rows | None = None
     friction: float = static(default=0.0)
 
-    def weighted(self, solver: Solver) -> "Contact":
+    def masses(self, solver: Solver) -> tuple[Array, Array | None]:
+        """Effective masses along normals, and along tangents if there is friction."""
+        return self.normal.masses(solver), self.tangent and self.tangent.masses(solver)
+
+    def weighted(self, mass: Array, tangent_mass: Array | None) -> "Contact":
         """With effective masses."""
-        tangent = None if self.tangent is None else self.tangent.weighted(solver)
-        return dataclasses.replace(self, normal=self.normal.weighted(solver), tangent=tangent)
+        tangent = self.tangent and dataclasses.replace(self.tangent, mass=tangent_mass)
+        return dataclasses.replace(self, normal=dataclasses.replace(self.normal, mass=mass), tangent=tangent)
 
     def answer(
         self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
@@ -253,16 +272,18 @@ class Contact:
         after = jnp.maximum(impulse - relaxation * error, 0)
         if self.tangent is None or slip is None:
             return (after, None), (after - impulse, None)
-        limit = self.friction * after.sum(0, keepdims=True)
+        limit = self.friction * total(after, 0)[None]
         slip_after = jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
         return (after, slip_after), (after - impulse, slip_after - slip)
 
-    def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None) -> Motions:
+    def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
         """The motions after these impulses."""
-        motions = self.normal.push(motions, impulse, solver)
-        return motions if self.tangent is None or slip is None else self.tangent.push(motions, slip, solver)
+        force = self.normal.force(impulse)
+        if self.tangent is not None and slip is not None:
+            force = Force(*jax.tree.map(operator.add, force, self.tangent.force(slip)))
+        return self.normal.push(solver, motions, force)
 
-
-def weigh_contacts(solver: Solver, contacts: dict[str, Contact]) -> dict[str, Contact]:
-    """The same, with effective masses."""
-    return {kind: contact.weighted(solver) for kind, contact in contacts.items()}
+    @property
+    def bodies(self) -> set[str]:
+        """The kinds of what it moves."""
+        return {self.normal.own, self.normal.other} - {"wall"}

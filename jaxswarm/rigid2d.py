@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxswarm.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver, weigh_contacts
+from jaxswarm.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver
 from jaxswarm.shapes import find_contacts, hold_discs, no_impulses
 from jaxswarm.types import pytree
 
@@ -184,7 +184,8 @@ def _substep(
     """Contacts where bodies are; velocities that keep them apart; then everything moves."""
     box = Pose(bodies.box.x, bodies.box.y, jnp.cos(bodies.box.turn), jnp.sin(bodies.box.turn))
     contacts = stage(partial(find_contacts, solver), side, bodies.disc, box, present)
-    contacts = stage(partial(weigh_contacts, solver), contacts)
+    masses = stage(lambda: {kind: contact.masses(solver) for kind, contact in contacts.items()})
+    contacts = {kind: contact.weighted(*masses[kind]) for kind, contact in contacts.items()}
     inertia = solver.drag * present if has_inertia else 0 * present
     motions = {"disc": drive, "box": jax.tree.map(lambda v: inertia * v, bodies.velocity)}
     motions, impulses = stage(partial(_warm_start, solver), contacts, motions, bodies.impulses)
@@ -206,7 +207,7 @@ def _warm_start(
     """Begins with the impulses of the substep before, where there still is contact."""
     impulses = {kind: impulses[kind] * contact.normal.near for kind, contact in contacts.items()}
     for kind, contact in contacts.items():
-        motions = contact.normal.push(motions, impulses[kind], solver)
+        motions = contact.push(solver, motions, impulses[kind])
     return motions, impulses
 
 
@@ -225,8 +226,9 @@ def _solve(
         relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
         impulses = {}
         for kind, contact in contacts.items():
-            impulses[kind], change = stage(partial(contact.answer, relaxation), motions, *before[kind])
-            motions = stage(partial(contact.push, solver), motions, *change)
+            moved = {body: motions[body] for body in contact.bodies}
+            impulses[kind], change = stage(partial(contact.answer, relaxation), moved, *before[kind])
+            motions = motions | stage(partial(contact.push, solver), moved, *change)
         return motions | {"disc": hold(motions["disc"])}, impulses
 
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
@@ -241,7 +243,7 @@ def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Mo
     for kind in ("box_box", "box_wall"):
         contact = contacts[kind]
         overlap = jnp.maximum(-contact.gap, 0)
-        shift = contact.normal.push(shift, solver.box_recovery * overlap * contact.normal.mass, solver)
+        shift = contact.push(solver, shift, solver.box_recovery * overlap * contact.normal.mass)
     return shift["box"]
 
 

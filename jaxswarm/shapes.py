@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, Contact, Motion, Pose, Rows, Solver, ahead, of_other, of_own
+from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, Contact, Motion, Pose, Rows, Solver, ahead, of_other, of_own, total
 
 _HALF = BOX_SIDE / 2
 
@@ -132,14 +132,14 @@ def _box_box(solver: Solver, box: Pose, present: Array) -> Contact:
 
     middle = _mean((point_u + _HALF) / 2, near)
     own_u, other_u = (sign * jnp.where(x, middle, middle - u) for x in (is_own, ~is_own))
-    touching = near.max(0, keepdims=True)
+    touching = jnp.minimum(total(near, 0), 1)[None]
     tangent = Rows(sign * face_y, -sign * face_x, -own_u, -other_u, touching, own="box", other="box")
     return Contact(normal, gap, _bias(solver, gap, 0.0), tangent, solver.box_friction)
 
 
 def _mean(values: Array, near: Array) -> Array:
     """Over the points of each pair that are in contact, with one point left."""
-    return (values * near).sum(0, keepdims=True) / jnp.maximum(near.sum(0, keepdims=True), 1)
+    return (total(values * near, 0) / jnp.maximum(total(near, 0), 1))[None]
 
 
 def _facing(own: Pose, other: Pose, dx: Array, dy: Array, is_own: Array) -> tuple[Array, ...]:
@@ -179,7 +179,7 @@ def _box_wall(solver: Solver, box: Pose, present: Array, side: Array) -> Contact
     normal = Rows(inward_x, inward_y, normal_arm, None, near, own="box", other="wall")
     tangent_arm = _mean(jnp.where(is_x, arm_x, -arm_y), near)
     tangent_x, tangent_y = jnp.where(is_x, zero[:1], 1.0), jnp.where(is_x, 1.0, zero[:1])
-    touching = near.max(0, keepdims=True)
+    touching = jnp.minimum(total(near, 0), 1)[None]
     tangent = Rows(tangent_x, tangent_y, tangent_arm, None, touching, own="box", other="wall")
     return Contact(normal, gap, _bias(solver, gap, 0.0), tangent, solver.wall_friction)
 
