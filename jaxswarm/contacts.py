@@ -3,9 +3,9 @@
 Contacts of one kind form `Rows`, dense arrays over all pairs: to compute all pairs of a few bodies is cheaper than to
 select those that touch. Worlds, any number of them, are the last axes: [..., *worlds].
 
-Bodies of two kinds meet in a table, with a row for each other body. Those of one kind stand in a circle, and row k pairs
-each with the one that is k + 1 places ahead: half a table holds every pair once, but for the last row of an even number,
-which has each twice.
+Bodies of two kinds meet in a table, with a row for each other body. Those of one kind stand in a circle, and row k
+pairs each with the one that is k + 1 places ahead: half a table holds every pair once, but for the last row of an even
+number, which has each twice.
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxswarm.types import is_whole, pytree, require, static
@@ -154,8 +155,12 @@ class Rows:
 
     def force(self, impulse: Float[Array, "points row own *worlds"]) -> "Force":
         """What these impulses do to the pairs."""
-        terms = impulse * self.x, impulse * self.y, _times(impulse, self.own_arm), _times(impulse, self.other_arm)
-        return Force(*(term if term is None else total(term, 0) for term in terms))
+
+        def torque(arm: Array | None) -> Array | None:
+            return None if arm is None else total(impulse * arm, 0)
+
+        x, y = total(impulse * self.x, 0), total(impulse * self.y, 0)
+        return Force(x, y, torque(self.own_arm), torque(self.other_arm))
 
     def push(self, solver: Solver, motions: Motions, force: "Force") -> Motions:
         """The motions after these impulses."""
@@ -188,10 +193,6 @@ class Force(NamedTuple):
     other_torque: Float[Array, "row own *worlds"] | None
 
 
-def _times(impulse: Array, arm: Array | None) -> Array | None:
-    return None if arm is None else impulse * arm
-
-
 def of_own(bodies: Any) -> Any:
     """Arrays [bodies, *worlds] as those of the own body of each pair."""
     return jax.tree.map(lambda v: v[None, None], bodies)
@@ -215,10 +216,9 @@ def ahead(bodies: Any) -> Any:
 
 def _behind(rows: Float[Array, "row own *worlds"]) -> Float[Array, "row other *worlds"]:
     """Numbers of the pairs in a circle, by their other body."""
-    num_rows, size, *worlds = rows.shape
-    laps = jnp.concatenate([rows, rows], 1).reshape(-1, *worlds)
-    laps = jnp.pad(laps[size - 1 :], [(0, size - 1 - num_rows)] + [(0, 0)] * len(worlds))
-    return laps.reshape(num_rows, 2 * size - 1, *worlds)[:, :size]
+    row, other = np.indices(rows.shape[:2])
+    own = (other - row - 1) % rows.shape[1]
+    return rows.reshape(-1, *rows.shape[2:]).at[row * rows.shape[1] + own].get(mode="promise_in_bounds")
 
 
 def _along(x: Array, y: Array, arm: Array | None, motion: Motion) -> Array:
@@ -266,15 +266,14 @@ class Contact:
 
     def answer(
         self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
-    ) -> tuple[tuple[Array, Array | None], tuple[Array, Array | None]]:
-        """Impulses of all pairs and of their friction that answer these motions, and by how much they changed."""
+    ) -> tuple[Array, Array | None]:
+        """Impulses of all pairs, and of their friction, that answer these motions, where those were `impulse, slip`."""
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
-        after = jnp.maximum(impulse - relaxation * error, 0)
+        impulse = jnp.maximum(impulse - relaxation * error, 0)
         if self.tangent is None or slip is None:
-            return (after, None), (after - impulse, None)
-        limit = self.friction * total(after, 0)[None]
-        slip_after = jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
-        return (after, slip_after), (after - impulse, slip_after - slip)
+            return impulse, None
+        limit = self.friction * total(impulse, 0)[None]
+        return impulse, jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
 
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
         """The motions after these impulses."""

@@ -183,7 +183,7 @@ def _substep(
 ) -> _Bodies:
     """Contacts where bodies are; velocities that keep them apart; then everything moves."""
     box = Pose(bodies.box.x, bodies.box.y, jnp.cos(bodies.box.turn), jnp.sin(bodies.box.turn))
-    contacts = stage(partial(find_contacts, solver), side, bodies.disc, box, present)
+    contacts = find_contacts(solver, side, bodies.disc, box, present, stage)
     masses = stage(lambda: {kind: contact.masses(solver) for kind, contact in contacts.items()})
     contacts = {kind: contact.weighted(*masses[kind]) for kind, contact in contacts.items()}
     inertia = solver.drag * present if has_inertia else 0 * present
@@ -224,17 +224,22 @@ def _solve(
     def sweep(index: Array | int, carry: tuple) -> tuple:
         motions, before = carry
         relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
-        impulses = {}
+        after = {}
         for kind, contact in contacts.items():
             moved = {body: motions[body] for body in contact.bodies}
-            impulses[kind], change = stage(partial(contact.answer, relaxation), moved, *before[kind])
-            motions = motions | stage(partial(contact.push, solver), moved, *change)
-        return motions | {"disc": hold(motions["disc"])}, impulses
+            after[kind] = stage(partial(contact.answer, relaxation), moved, *before[kind])
+            motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], before[kind])
+        return motions | {"disc": hold(motions["disc"])}, after
 
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
     start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
     motions, impulses = jax.lax.fori_loop(0, solver.iterations, sweep, (motions, start))
     return motions, {kind: impulse for kind, (impulse, _) in impulses.items()}
+
+
+def _correct(solver: Solver, contact: Contact, motions: Motions, after: tuple, before: tuple) -> Motions:
+    """The motions, now that these are the impulses and no longer those."""
+    return contact.push(solver, motions, *jax.tree.map(jnp.subtract, after, before))
 
 
 def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Motion:

@@ -3,12 +3,16 @@
 Worlds, any number of them, are the last axes: [..., *worlds].
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, Contact, Motion, Pose, Rows, Solver, ahead, of_other, of_own, total
+from jaxswarm.types import pytree
 
 _HALF = BOX_SIDE / 2
 
@@ -19,13 +23,14 @@ def find_contacts(
     disc: Pose,
     box: Pose,
     present: Float[Array, "boxes *worlds"],
+    stage: Callable,
 ) -> dict[str, Contact]:
-    """All pairs that might touch, by kind, in the order in which they are solved."""
+    """All pairs that might touch, by kind, in the order in which they are solved; `stage` calls its parts."""
     return {
-        "box_wall": _box_wall(solver, box, present, side[None, None, None]),
-        "box_box": _box_box(solver, box, present),
-        "disc_box": _disc_box(solver, disc, box, present),
-        "disc_disc": _disc_disc(solver, disc),
+        "box_wall": stage(partial(_box_wall, solver), box, present, side[None, None, None]),
+        "box_box": stage(partial(_box_box, solver), stage(_facing, box), present),
+        "disc_box": stage(partial(_disc_box, solver), disc, box, present),
+        "disc_disc": stage(partial(_disc_disc, solver), disc),
     }
 
 
@@ -102,14 +107,25 @@ def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
     return Contact(rows, gap, _bias(solver, gap, solver.recovery))
 
 
-def _box_box(solver: Solver, box: Pose, present: Array) -> Contact:
-    """Two points for each pair: the facing edge of one box, clipped to the width of the face of the other.
+@pytree
+class _Facing:
+    """Of each pair of boxes, the face of one, the reference, that separates them, and where the other box is.
 
-    The separating axis is that of the box, then called the reference, from whose face the other is farther. In its
-    axes, u along the normal of that face and t along the face, the other box is at (u, t), turned by an angle that
-    equal squares allow to reduce to a turn of at most 45 degrees either way.
+    In axes of the reference, u along the normal of that face and t along the face, the other box is at (u, t), turned
+    by an angle that equal squares allow to reduce to a turn of at most 45 degrees either way.
     """
-    is_pair, is_first = _pairs(box.x)
+
+    is_own: Array  # the reference is the own box; like all others [1, row, own, *worlds]
+    x: Array  # the normal, from the reference to the other box, in world axes
+    y: Array
+    u: Array
+    t: Array
+    cos: Array
+    sin: Array
+
+
+def _facing(box: Pose) -> _Facing:
+    """The reference is the box from whose face the other is farther."""
     own, other = of_own(box), ahead(box)
     dx, dy = other.x - own.x, other.y - own.y
 
@@ -117,46 +133,52 @@ def _box_box(solver: Solver, box: Pose, present: Array) -> Contact:
         return jnp.maximum(jnp.abs(pose.cos * dx + pose.sin * dy), jnp.abs(pose.cos * dy - pose.sin * dx))
 
     own_separation, other_separation = separation(own), separation(other)
+    _, is_first = _pairs(box.x)
     is_own = (own_separation > other_separation) | ((own_separation == other_separation) & is_first)
-    sign = jnp.where(is_own, 1.0, -1.0)
-    face_x, face_y, u, t, turn_cos, turn_sin = _facing(own, other, dx, dy, is_own)
-    edge_u, edge_t = u - _HALF * turn_cos, t - _HALF * turn_sin
-    end = _table(np.array([-_HALF, _HALF])[:, None, None], box.x)
-    point_t = jnp.clip(edge_t + end * turn_cos, -_HALF, _HALF)
-    point_u = edge_u - (point_t - edge_t) * (turn_sin / turn_cos)
-    gap = point_u - _HALF - solver.offsets.box_box
-    is_pair = is_pair * of_own(present) * ahead(present)
-    near = (gap < solver.margin) * is_pair
-    own_t, other_t = (sign * jnp.where(x, point_t, point_t - t) for x in (is_own, ~is_own))
-    normal = Rows(-sign * face_x, -sign * face_y, own_t, other_t, near, own="box", other="box")
-
-    middle = _mean((point_u + _HALF) / 2, near)
-    own_u, other_u = (sign * jnp.where(x, middle, middle - u) for x in (is_own, ~is_own))
-    touching = jnp.minimum(total(near, 0), 1)[None]
-    tangent = Rows(sign * face_y, -sign * face_x, -own_u, -other_u, touching, own="box", other="box")
-    return Contact(normal, gap, _bias(solver, gap, 0.0), tangent, solver.box_friction)
-
-
-def _mean(values: Array, near: Array) -> Array:
-    """Over the points of each pair that are in contact, with one point left."""
-    return (total(values * near, 0) / jnp.maximum(total(near, 0), 1))[None]
-
-
-def _facing(own: Pose, other: Pose, dx: Array, dy: Array, is_own: Array) -> tuple[Array, ...]:
-    """The normal of the reference's face, in world axes; in its own, where the other box is: u, t, cos, sin."""
     sign = jnp.where(is_own, 1.0, -1.0)
     cos, sin = jnp.where(is_own, own.cos, other.cos), jnp.where(is_own, own.sin, other.sin)
     x, y = sign * (cos * dx + sin * dy), sign * (cos * dy - sin * dx)
     by_x = jnp.abs(x) >= jnp.abs(y)
     side = jnp.where(jnp.where(by_x, x, y) >= 0, 1.0, -1.0)
     normal_x, normal_y = jnp.where(by_x, side, 0), jnp.where(by_x, 0, side)
-    u, t = jnp.where(by_x, jnp.abs(x), jnp.abs(y)), y * normal_x - x * normal_y
     turn_cos = own.cos * other.cos + own.sin * other.sin
     turn_sin = sign * (own.cos * other.sin - own.sin * other.cos)
     is_small = jnp.abs(turn_cos) >= jnp.abs(turn_sin)
-    reduced_cos = jnp.where(is_small, jnp.abs(turn_cos), jnp.abs(turn_sin))
-    reduced_sin = jnp.where(is_small, turn_sin * jnp.sign(turn_cos), -turn_cos * jnp.sign(turn_sin))
-    return cos * normal_x - sin * normal_y, sin * normal_x + cos * normal_y, u, t, reduced_cos, reduced_sin
+    return _Facing(
+        is_own=is_own,
+        x=cos * normal_x - sin * normal_y,
+        y=sin * normal_x + cos * normal_y,
+        u=jnp.where(by_x, jnp.abs(x), jnp.abs(y)),
+        t=y * normal_x - x * normal_y,
+        cos=jnp.where(is_small, jnp.abs(turn_cos), jnp.abs(turn_sin)),
+        sin=jnp.where(is_small, turn_sin * jnp.sign(turn_cos), -turn_cos * jnp.sign(turn_sin)),
+    )
+
+
+def _box_box(solver: Solver, facing: _Facing, present: Array) -> Contact:
+    """Two points for each pair: the facing edge of one box, clipped to the width of the face of the other."""
+    is_own, u, t = facing.is_own, facing.u, facing.t
+    sign = jnp.where(is_own, 1.0, -1.0)
+    edge_u, edge_t = u - _HALF * facing.cos, t - _HALF * facing.sin
+    end = _table(np.array([-_HALF, _HALF])[:, None, None], present)
+    point_t = jnp.clip(edge_t + end * facing.cos, -_HALF, _HALF)
+    point_u = edge_u - (point_t - edge_t) * (facing.sin / facing.cos)
+    gap = point_u - _HALF - solver.offsets.box_box
+    is_pair, _ = _pairs(present)
+    near = (gap < solver.margin) * is_pair * of_own(present) * ahead(present)
+    own_t, other_t = (sign * jnp.where(x, point_t, point_t - t) for x in (is_own, ~is_own))
+    normal = Rows(-sign * facing.x, -sign * facing.y, own_t, other_t, near, own="box", other="box")
+
+    middle = _mean((point_u + _HALF) / 2, near)
+    own_u, other_u = (sign * jnp.where(x, middle, middle - u) for x in (is_own, ~is_own))
+    touching = jnp.minimum(total(near, 0), 1)[None]
+    tangent = Rows(sign * facing.y, -sign * facing.x, -own_u, -other_u, touching, own="box", other="box")
+    return Contact(normal, gap, _bias(solver, gap, 0.0), tangent, solver.box_friction)
+
+
+def _mean(values: Array, near: Array) -> Array:
+    """Over the points of each pair that are in contact, with one point left."""
+    return (total(values * near, 0) / jnp.maximum(total(near, 0), 1))[None]
 
 
 def _box_wall(solver: Solver, box: Pose, present: Array, side: Array) -> Contact:
