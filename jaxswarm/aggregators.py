@@ -283,11 +283,14 @@ class Attentive(nn.Module):
 def _attention(
     view: DenseView, queries: Float[Array, "size d"], keys: Float[Array, "size d"], query_bias: Float[Array, " d"]
 ) -> tuple[Float[Array, "receivers slots slots"], Float[Array, "receivers slots"]]:
-    """p_ij of one head as `_exponentials`; scores as the bilinear form x_i (W_q W_k^T) x_j + (b_q W_k^T) x_j."""
-    x, size = view.messages, view.messages.shape[-1]
-    W_qk, b_qk = (a @ keys.T / math.sqrt(keys.shape[-1]) for a in (queries, query_bias))
-    query = (x.reshape(-1, size) @ W_qk + b_qk[None]).reshape(x.shape)
-    return _exponentials(jnp.einsum("rie,rje->rij", query, x), view.mask[:, None])
+    """p_ij of one head as `_exponentials`."""
+    x, (size, d) = view.messages, keys.shape
+
+    def project(kernel: Array) -> Array:
+        return (x.reshape(-1, size) @ kernel).reshape(*x.shape[:2], d)
+
+    query = (project(queries) + query_bias[None, None]) / math.sqrt(d)
+    return _exponentials(jnp.einsum("rid,rjd->rij", query, project(keys)), view.mask[:, None])
 
 
 def _exponentials(score: Float[Array, "*n slots"], mask: Bool[Array, "*#n slots"]) -> tuple[Array, Array]:
