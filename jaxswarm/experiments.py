@@ -32,7 +32,10 @@ FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """What a figure's file says, and the curves of the thesis by the names of the series, which may be none."""
+    """What a figure's file says, and the curves of the thesis by the names of the series, which may be none.
+
+    Figures of the thesis name their series as it does; others say by `thesis` beside which of its series each is.
+    """
 
     name: str
     title: str
@@ -50,9 +53,14 @@ class Figure:
 
 
 def names() -> list[str]:
-    """All figures, in the order of the thesis."""
+    """All figures, in the order of the thesis, then our own."""
     found = (path.stem for path in (configs.config_dir() / configs.FIGURES).glob("*.yaml"))
-    return sorted(found, key=lambda name: [(not x.isdigit(), int(x) if x.isdigit() else 0, x) for x in name.split("_")])
+
+    def place(name: str) -> tuple:
+        parts = [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in name.split("_")]
+        return name.startswith("best_"), parts
+
+    return sorted(found, key=place)
 
 
 def load(name: str) -> Figure:
@@ -61,10 +69,12 @@ def load(name: str) -> Figure:
         raise ConfigError(f"{name} is no figure; accepted: all, {', '.join(names())}")
     fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
     words, reference = fields.pop("words").split(), fields.pop("reference", None)
+    thesis = fields.pop("thesis", None) or {series: series for series in fields["series"]}
     fields["series"] = {series: (*words, *own.split()) for series, own in fields["series"].items()}
     fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
     fields["y"] = tuple(fields.pop("y", ["linear"]))
-    return Figure(name=name, references=_references(CURVES / f"{reference}.csv") if reference else {}, **fields)
+    lines = _references(CURVES / f"{reference}.csv") if reference else {}
+    return Figure(name=name, references={own: lines[theirs] for own, theirs in thesis.items() if lines}, **fields)
 
 
 def stored(directory: Path) -> list[RunFolder]:
@@ -115,7 +125,7 @@ def measure(
             shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
             line = _until(curves.summarize(shifted, "median"), end)
             reference = figure.references.get(series)
-            measured[series] = Measured(line, reference or line, float(reference.x[-1]) if reference else end)
+            measured[series] = Measured(line, reference or line, min(end, float(reference.x[-1])) if reference else end)
     return measured
 
 

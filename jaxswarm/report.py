@@ -29,7 +29,7 @@ def section(figure: Figure, trials: Mapping[str, Trial], measured: Mapping[str, 
         return f"{title}Not run.\n"
     pictures = [f"![{figure.title}]({name}.png)" for name in figure.pictures]
     changed = [f"Not as in the thesis: {' '.join(words)}."] if words else []
-    tables = [_table(figure, trials, measured), _verdicts(figure, measured)]
+    tables = [_table(figure, trials, measured), *([_verdicts(figure, measured)] if figure.claims else [])]
     return title + "\n\n".join([*pictures, *changed, *_cuts(measured), *tables]) + "\n"
 
 

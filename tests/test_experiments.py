@@ -102,6 +102,7 @@ RUNS = {
         "Max Agg.": (20, "max", "ppo", MEDIUM, 70_965),
     }),
 }  # fmt: skip
+BEST = {"best_rendezvous": "rendezvous", "best_pursuit": "pursuit", "best_assembly": "assembly"}  # our own; tasks
 LEARNING = {"learning_rate": 3e-4, "adam_epsilon": 1e-5, "num_epochs": 10, "bootstrap_truncation": False}
 TINY = [
     *("task.num_agents=3", "task.num_evaders=1", "task.episode_length=5", "num_worlds=2", "num_steps=4"),
@@ -132,7 +133,7 @@ def num_parameters(experiment, counted={}):  # noqa: B006
 
 
 def test_every_figure_is_in_the_table():
-    assert RUNS.keys() == set(experiments.names())
+    assert RUNS.keys() | BEST.keys() == set(experiments.names())
     assert not {configs.FIGURES, configs.SEARCHES} & configs.choices().keys()
 
 
@@ -155,6 +156,21 @@ def test_every_series_is_what_was_run(name):
         assert {field: getattr(run.learner, field) for field in LEARNING} == LEARNING
         assert (run.eval_every, run.eval_worlds, run.desynchronised_start) == (1, 20, False)
         assert count is None or count == num_parameters(run), series
+
+
+@pytest.mark.parametrize("name", BEST)
+def test_our_own_settings_are_shorter_than_the_curve_beside_them(name):
+    figure = experiments.load(name)
+    assert figure.references.keys() == figure.series.keys()
+    for series, words in figure.series.items():
+        run, settings = configs.build(compose(words)), configs.run_settings(compose(words))
+        end = figure.num_updates * run.agent_steps_per_update
+        assert settings.length(run.agent_steps_per_update) == figure.num_updates
+        assert end < figure.references[series].x[-1]
+        assert compose(words)["task"]["name"] == BEST[name]
+        fields = {"num_agents": run.task.num_agents, "episode_length": run.task.episode_length}
+        thesis = configs.build(compose((f"experiment={BEST[name]}_thesis",))).task
+        assert fields == {"num_agents": thesis.num_agents, "episode_length": thesis.episode_length}
 
 
 def test_tasks_are_those_of_the_thesis():
