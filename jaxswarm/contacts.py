@@ -54,7 +54,7 @@ class Solver:
     """How finely a step is solved; a step of 1 s has `substeps`."""
 
     substeps: int = 10
-    iterations: int = 6
+    iterations: int = 4
     relaxation: float = 1.5  # of impulses, in (0, 2); the last sweep has 1, which is exact for what one sweep can solve
     recovery: float = 0.3  # share of an overlap with a disc that is removed per substep, by its velocity
     box_recovery: float = 0.5  # share of an overlap without discs that is removed per substep, by displacement

@@ -224,12 +224,15 @@ def _solve(
     def sweep(index: Array | int, carry: tuple) -> tuple:
         motions, before = carry
         relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
-        after = {}
-        for kind, contact in contacts.items():
+        after = dict(before)
+        for kind in (*contacts, "disc_disc"):
+            contact, last = contacts[kind], after[kind]
             moved = {body: motions[body] for body in contact.bodies}
-            after[kind] = stage(partial(contact.answer, relaxation), moved, *before[kind])
-            motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], before[kind])
-        return motions | {"disc": hold(motions["disc"])}, after
+            after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
+            motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
+            if kind == "disc_disc":
+                motions = motions | {"disc": hold(motions["disc"])}
+        return motions, after
 
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
     start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
