@@ -129,21 +129,26 @@ class Rows:
     other: str = static()
     mass: Any = None  # once `weighted`: effective mass in contact, else 0; like the others
 
-    def masses(self, solver: Solver) -> Float[Array, "points row own *worlds"]:
+    def counts(self) -> dict[str, Float[Array, "bodies *worlds"]]:
+        """How many contacts each body has, at least 1."""
+        near = total(self.near, 0)
+        count = {self.own: total(near, 0)}
+        if self.other != "wall":
+            count[self.other] = self._by_other(near) + count.get(self.other, 0.0)
+        return {kind: jnp.maximum(number, 1) for kind, number in count.items()}
+
+    def masses(
+        self, solver: Solver, counts: dict[str, Float[Array, "bodies *worlds"]]
+    ) -> Float[Array, "points row own *worlds"]:
         """In contact 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)), n the number of contacts of a body; else 0."""
 
         def mobility(kind: str, arm: Array | None) -> Array | float:
             linear, angular = _inverse_mass(kind, solver)
             return linear if arm is None else linear + angular * arm**2
 
-        near = total(self.near, 0)
-        count = {self.own: total(near, 0)}
+        inverse = of_own(counts[self.own]) * mobility(self.own, self.own_arm)
         if self.other != "wall":
-            count[self.other] = self._by_other(near) + count.get(self.other, 0.0)
-        count = {kind: jnp.maximum(number, 1) for kind, number in count.items()}
-        inverse = of_own(count[self.own]) * mobility(self.own, self.own_arm)
-        if self.other != "wall":
-            inverse = inverse + self._of_other(count[self.other]) * mobility(self.other, self.other_arm)
+            inverse = inverse + self._of_other(counts[self.other]) * mobility(self.other, self.other_arm)
         return self.near / inverse
 
     def velocity(self, motions: Motions) -> Float[Array, "points row own *worlds"]:
@@ -255,9 +260,14 @@ class Contact:
     tangent: Rows | None = None
     friction: float = static(default=0.0)
 
-    def masses(self, solver: Solver) -> tuple[Array, Array | None]:
+    def counts(self) -> tuple[dict[str, Array], dict[str, Array] | None]:
+        """How many contacts each body has; the same for friction, which a pair has once."""
+        return self.normal.counts(), self.tangent and self.tangent.counts()
+
+    def masses(self, solver: Solver, counts: tuple) -> tuple[Array, Array | None]:
         """Effective masses along normals, and along tangents if there is friction."""
-        return self.normal.masses(solver), self.tangent and self.tangent.masses(solver)
+        normal, tangent = counts
+        return self.normal.masses(solver, normal), self.tangent and self.tangent.masses(solver, tangent)
 
     def weighted(self, mass: Array, tangent_mass: Array | None) -> "Contact":
         """With effective masses."""

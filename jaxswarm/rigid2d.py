@@ -184,7 +184,8 @@ def _substep(
     """Contacts where bodies are; velocities that keep them apart; then everything moves."""
     box = Pose(bodies.box.x, bodies.box.y, jnp.cos(bodies.box.turn), jnp.sin(bodies.box.turn))
     contacts = find_contacts(solver, side, bodies.disc, box, present, stage)
-    masses = stage(lambda: {kind: contact.masses(solver) for kind, contact in contacts.items()})
+    counts = stage(lambda: {kind: contact.counts() for kind, contact in contacts.items()})
+    masses = stage(lambda: {kind: contact.masses(solver, counts[kind]) for kind, contact in contacts.items()})
     contacts = {kind: contact.weighted(*masses[kind]) for kind, contact in contacts.items()}
     inertia = solver.drag * present if has_inertia else 0 * present
     motions = {"disc": drive, "box": jax.tree.map(lambda v: inertia * v, bodies.velocity)}
