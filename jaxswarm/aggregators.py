@@ -285,12 +285,14 @@ def _attention(
 ) -> tuple[Float[Array, "receivers slots slots"], Float[Array, "receivers slots"]]:
     """p_ij of one head as `_exponentials`."""
     x, (size, d) = view.messages, keys.shape
+    scale = 1 / math.sqrt(d)
 
     def project(kernel: Array) -> Array:
-        return (x.reshape(-1, size) @ kernel).reshape(*x.shape[:2], d)
+        return x.reshape(-1, size) @ kernel
 
-    query = (project(queries) + query_bias[None, None]) / math.sqrt(d)
-    return _exponentials(jnp.einsum("rid,rjd->rij", query, project(keys)), view.mask[:, None])
+    query = (project(queries * scale) + (query_bias * scale)[None]).reshape(*x.shape[:2], d)
+    key = project(keys).reshape(*x.shape[:2], d)
+    return _exponentials(jnp.einsum("rid,rjd->rij", query, key), view.mask[:, None])
 
 
 def _exponentials(score: Float[Array, "*n slots"], mask: Bool[Array, "*#n slots"]) -> tuple[Array, Array]:
