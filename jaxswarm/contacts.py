@@ -54,7 +54,7 @@ class Solver:
     """How finely a step is solved; a step of 1 s has `substeps`."""
 
     substeps: int = 10
-    iterations: int = 4
+    iterations: int = 4  # sweeps, in which discs meet discs twice
     relaxation: float = 1.5  # of impulses, in (0, 2); the last sweep has 1, which is exact for what one sweep can solve
     recovery: float = 0.3  # share of an overlap with a disc that is removed per substep, by its velocity
     box_recovery: float = 0.5  # share of an overlap without discs that is removed per substep, by displacement
@@ -293,6 +293,6 @@ class Contact:
         return self.normal.push(solver, motions, force)
 
     @property
-    def bodies(self) -> set[str]:
+    def bodies(self) -> tuple[str, ...]:
         """The kinds of what it moves."""
-        return {self.normal.own, self.normal.other} - {"wall"}
+        return tuple(kind for kind in ("disc", "box") if kind in (self.normal.own, self.normal.other))
