@@ -149,7 +149,8 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
         _draw_line(axes, series, picture.is_step, 0.12, style)
     if len(ours) == 1 and len(ours[0].line.x) and not picture.is_step:
         end, text = (ours[0].line.x[-1], ours[0].line.y[-1]), _signed(ours[0].line.y[-1])
-        axes.annotate(text, end, (6, 0), textcoords="offset points", va="center", annotation_clip=False)
+        ground = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+        axes.annotate(text, end, (6, 0), textcoords="offset points", va="center", annotation_clip=False, bbox=ground)
 
 
 def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, style: dict[str, Any]) -> None:
