@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxswarm.types import Entities, pytree, static
 
@@ -175,6 +175,15 @@ def dense_view(messages: Float[Array, "messages features"], segments: Segments) 
     features = features.at[receiver, rank].set(messages[order], mode="drop")
     mask = jnp.zeros((num_receivers, num_slots), bool).at[receiver, rank].set(True, mode="drop")
     return DenseView(features, mask, segments.own)
+
+
+def shares(
+    importance: Shaped[Array, "receivers slots features"], mask: Bool[Array, "receivers slots"]
+) -> Float[Array, "receivers slots"]:
+    """Importance over its sum over the entities that are present, mean over the features."""
+    importance = jnp.where(mask[..., None], importance, 0).astype(jnp.float32)
+    total = importance.sum(1, keepdims=True)
+    return (importance / jnp.where(total > 0, total, 1.0)).mean(-1)
 
 
 def _lift(monoid: Monoid, is_present: Bool[Array, " n"], parts: Sequence[Array]) -> Summary:

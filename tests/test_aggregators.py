@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxswarm import AGGREGATORS
-from jaxswarm.aggregators import softplus_precision
+from jaxswarm.aggregators.monoids import softplus_precision
 from jaxswarm.sets import DenseView, Segments, segments_of
 
 WIDTH, SLOTS, RECEIVERS, OWN = 4, 5, 3, 2

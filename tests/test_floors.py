@@ -13,9 +13,10 @@ PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types", "scene"},
     {"geometry", "contacts", "sets", "distributions"},
-    {"dynamics", "neighbors", "shapes", "aggregators"},
-    {"rigid2d", "tasks.swarm", "tasks.evasion", "networks"},
-    {"tasks.rendezvous", "tasks.pursuit", "tasks.boxes"},
+    {"dynamics", "neighbors", "shapes", "aggregators.monoids", "aggregators.attentive"},
+    {"rigid2d", "tasks.swarm", "tasks.evasion", "aggregators.features"},
+    {"tasks.rendezvous", "tasks.pursuit", "tasks.arena", "aggregators"},
+    {"tasks.boxes", "networks"},
     {"tasks"},
     {"rollout"},
     {"learners.on_policy"},
