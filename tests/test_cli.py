@@ -113,6 +113,16 @@ def test_a_wrong_command_is_one_line_and_writes_nothing(tmp_path, monkeypatch, c
     assert not list(tmp_path.iterdir())
 
 
+def test_a_reader_that_goes_away_is_no_mistake():
+    reader, writer = os.pipe()
+    os.close(reader)
+    program = "import sys; from jaxswarm.cli.sweep import main; sys.exit(main(['--help']))"
+    run = [sys.executable, "-c", program]
+    ended = subprocess.run(run, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
 def test_help_shows_groups_choices_and_keys(capsys):
     assert train.main(["--help"]) == 0
     out = capsys.readouterr().out

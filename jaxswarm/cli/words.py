@@ -22,13 +22,18 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
     def program(arguments: Sequence[str] | None = None) -> int:
         gc.set_threshold(200_000)  # importing and tracing make many objects and little garbage: a tenth of the start
         try:
-            return main(sys.argv[1:] if arguments is None else arguments)
+            code = main(sys.argv[1:] if arguments is None else arguments)
+            sys.stdout.flush()
+            return code
         except ConfigError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print("aborted", file=sys.stderr)
             return 130
+        except BrokenPipeError:  # whoever read the output has gone, as after `| head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+            return 141
 
     return program
 
