@@ -284,6 +284,7 @@ def test_wrong_words_are_errors(capsys):
         (["fig_9_9"], "is no figure"),
         (["fig_6_15", "scale=2"], "numbers above 0"),
         (["fig_6_15", "seeds=0"], "integers from 1"),
+        (["fig_6_15", "series=mu*"], "'μ only', 'μ+σ²'"),
         (["all", "seeds=3"], "no meaning here"),
     ]:
         assert program.main(words) == 2
@@ -300,9 +301,10 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
         return real(trials)
 
     monkeypatch.setattr(sweep, "train", train)
-    assert program.main([*words, "scale=0.006"]) == 0
+    assert program.main([*words, "scale=0.006", "series=*only"]) == 0
+    assert "not enough runs" in capsys.readouterr().out
+    assert program.main([*words, "scale=0.006"]) == 0  # trains the other one
     assert "run was cut" in capsys.readouterr().out
-    assert program.main([*words, "scale=0.006"]) == 0  # nothing is left to train
     assert program.main([*words, "scale=0.01"]) == 0  # goes on in the same folders
     assert lengths == [3, 3, 4, 4]
     folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}

@@ -1,5 +1,6 @@
 """The program `jaxswarm-experiment`."""
 
+import fnmatch
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from jaxswarm.cli.words import command, program, split, use_compile_cache, use_c
 from jaxswarm.config import ConfigError
 
 HELP = """\
-jaxswarm-experiment FIGURE [seeds=N] [scale=1.0] [dir=runs/figures] [out=PATH] [key=value ...]
+jaxswarm-experiment FIGURE [seeds=N] [scale=1.0] [series=PATTERN] [dir=runs/figures] [out=PATH] [key=value ...]
 jaxswarm-experiment all [dir=runs/figures] [out=benchmarks/results] [key=value ...]
 
 Trains all series of a figure of the thesis as they were trained there, and writes the figure with the curves of the
@@ -20,6 +21,7 @@ Figures share run folders where their series are the same. all trains nothing: i
 
   seeds=N          of each series; default: as many as verdicts need
   scale=0.1        a tenth of the updates; verdicts then say that the runs were cut. A larger scale goes on from there
+  series=PATTERN   only series with such names, * for anything: series='Mean*'
   dir=PATH         where the run folders are
   out=PATH         where figures and report are written; default: dir, and for all benchmarks/results
   key=value        a key of jaxswarm-train, for every series; runs with other keys are runs of their own
@@ -27,9 +29,10 @@ Figures share run folders where their series are the same. all trains nothing: i
 examples
   jaxswarm-experiment fig_6_1
   jaxswarm-experiment fig_6_5 seeds=4 scale=0.1
+  jaxswarm-experiment fig_6_1 series='*(simple)'
   jaxswarm-experiment all
 """
-OPTIONS = ("seeds", "scale", "dir", "out")
+OPTIONS = ("seeds", "scale", "series", "dir", "out")
 
 
 @program
@@ -39,27 +42,26 @@ def main(arguments: Sequence[str]) -> int:
         print(HELP + "\n" + _figures_help())
         return 0 if arguments else 2
     name, (options, words) = arguments[0], split(arguments[1:], OPTIONS)
-    if name == "all" and {"seeds", "scale"} & options.keys():
-        raise ConfigError("seeds and scale have no meaning here; all reports what has been trained")
+    if name == "all" and {"seeds", "scale", "series"} & options.keys():
+        raise ConfigError("seeds, scale and series have no meaning here; all reports what has been trained")
     directory = Path(options.get("dir", "runs/figures"))
     out = Path(options.get("out", "benchmarks/results" if name == "all" else directory))
     try:
         if name == "all":
             return _report_all(directory, out, words)
-        num_seeds = whole("seeds", options["seeds"], 1) if "seeds" in options else None
-        return _run(arguments, directory, out, num_seeds, _scale(options.get("scale", "1")), words)
+        return _run(arguments, directory, out, options, words)
     except OSError as error:
         raise ConfigError(f"cannot write to {error.filename}: {error.strerror}") from error
 
 
-def _run(
-    arguments: Sequence[str], directory: Path, out: Path, num_seeds: int | None, scale: float, words: Sequence[str]
-) -> int:
+def _run(arguments: Sequence[str], directory: Path, out: Path, options: dict[str, str], words: Sequence[str]) -> int:
     from jaxswarm import experiments  # noqa: PLC0415
 
     figure = experiments.load(arguments[0])
+    num_seeds = whole("seeds", options["seeds"], 1) if "seeds" in options else None
+    scale, chosen = _scale(options.get("scale", "1")), _choose(list(figure.series), options.get("series", "*"))
     trials = experiments.plan(figure, directory, experiments.stored(directory), num_seeds, scale, words)
-    if not _train(trials):
+    if not _train({series: trials[series] for series in chosen}):
         print(f"stopped; continue with: {command('jaxswarm-experiment', *arguments)}")
         return 0
     section = _section(figure, trials, experiments.stored(directory), out, words)
@@ -105,6 +107,14 @@ def _train(trials: dict) -> bool:
         if not experiments.is_finished(trial) and not sweep.train([trial])[0]:
             return False
     return True
+
+
+def _choose(series: Sequence[str], pattern: str) -> list[str]:
+    """The series with such names."""
+    chosen = fnmatch.filter(series, pattern)
+    if not chosen:
+        raise ConfigError(f"series = {pattern} is in no name; accepted: patterns for {', '.join(map(repr, series))}")
+    return chosen
 
 
 def _scale(text: str) -> float:
