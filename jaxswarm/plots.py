@@ -142,9 +142,9 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
         marks = {"marker": marker, "markersize": 4, "markevery": (number % every, every)}
         style |= marks | ({"drawstyle": "steps-post"} if picture.is_step else {})
         _draw_line(axes, series, picture.is_step, 0.2, style)
-    places = {series.label: number for number, series in enumerate(ours)}
+    labels = list(dict.fromkeys(series.label for series in [*ours, *references]))
     for number, series in enumerate(references):
-        color = _tint(COLORS[places.get(series.label, len(ours) + number) % len(COLORS)])
+        color = _tint(COLORS[labels.index(series.label) % len(COLORS)])
         style = {"color": color, "linewidth": 1.4, "linestyle": DASHES[number % len(DASHES)], "zorder": 2}
         _draw_line(axes, series, picture.is_step, 0.12, style)
     if len(ours) == 1 and len(ours[0].line.x) and not picture.is_step:
