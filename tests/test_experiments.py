@@ -305,6 +305,7 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     assert "not enough runs" in capsys.readouterr().out
     assert program.main([*words, "scale=0.006"]) == 0  # trains the other one
     assert "run was cut" in capsys.readouterr().out
+    assert program.main([*words, "scale=0.006"]) == 0  # nothing is left to train
     assert program.main([*words, "scale=0.01"]) == 0  # goes on in the same folders
     assert lengths == [3, 3, 4, 4]
     folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}
