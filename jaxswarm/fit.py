@@ -154,6 +154,7 @@ def _train(states: TrainState, num_updates: int, desk: "_Desk", stop: threading.
         if in_flight:
             desk.record(in_flight)
         else:
+            desk.progress.begin()
             desk.open(num_updates)
         in_flight = _Chunk(update, length, metrics, before, bool(is_due))
         update += length

@@ -149,8 +149,9 @@ class Progress:
         self._num_updates = num_updates
         self._agent_steps_per_update = agent_steps_per_update
         self._is_shown = is_shown
-        self._first: tuple[float, int] | None = None  # when the first chunk was done: compiling is over
+        self._first: tuple[float, int] | None = None  # when the first chunk was done
         self._last_line = -math.inf
+        self._started = time.monotonic()
         self._update = update
         self._bar = self._make_bar() if is_shown else None
 
@@ -164,6 +165,13 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         if self._bar:
             self._bar.stop()
+
+    def begin(self) -> None:
+        """Shows that compiling is over: the first chunk of a slow run takes minutes."""
+        if self._bar:
+            self._bar.update(self._task, rate="training")
+        elif self._is_shown:
+            print(f"compiled in {time.monotonic() - self._started:.0f} s; training ...", flush=True)
 
     def advance(self, update: int, evaluation: float | None) -> None:
         """Shows that so many updates are done; `evaluation` is the latest mean return."""
