@@ -216,8 +216,6 @@ def build(config: Config) -> "Experiment":
     from jaxswarm.networks import ActorCritic  # noqa: PLC0415
     from jaxswarm.training import Experiment  # noqa: PLC0415
 
-    if not config["network"]["encoder"]:
-        raise ConfigError("network.encoder = [] is not possible; accepted: at least one layer, like [64]")
     try:
         task = build_part("task", config)
         fields = _tuples(config["network"])

@@ -49,20 +49,21 @@ def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> Batch:
     structures = {jax.tree.structure(experiment) for experiment in experiments}
     if len(structures) > 1:
         raise ValueError("experiments differ in what fixes a program's shapes; accepted: such as differ in numbers")
-    stacked = [np.repeat(np.asarray(x, np.float32), num_seeds) for x in zip(*leaves, strict=True)]
+    stacked = [np.repeat(_stack(x), num_seeds, axis=0) for x in zip(*leaves, strict=True)]
     batch = jax.tree.unflatten(structures.pop(), stacked)
     return Batch(batch, make_mesh(len(experiments) * num_seeds, experiments[0].num_worlds))
+
+
+def _stack(numbers: Sequence[Any]) -> np.ndarray:
+    """One row per experiment, in JAX's own precision."""
+    stacked = np.stack([np.asarray(x) for x in numbers])
+    return stacked.astype(jax.dtypes.canonicalize_dtype(stacked.dtype))
 
 
 def make_mesh(num_runs: int, num_worlds: int) -> Mesh | None:
     """As many devices as divide runs and worlds, `None` if that is one; several processes need all of theirs."""
     num_devices = jax.device_count()
-    shapes = [
-        (runs, math.gcd(num_worlds, num_devices // runs))
-        for runs in range(1, num_devices + 1)
-        if num_runs % runs == 0 and num_devices % runs == 0
-    ]
-    runs, worlds = max(shapes, key=lambda shape: (math.prod(shape), shape))
+    runs, worlds = mesh_shape(num_runs, num_worlds, num_devices)
     if jax.process_count() > 1 and runs * worlds < num_devices:
         raise ValueError(
             f"{num_runs} runs of {num_worlds} worlds cannot be spread over {num_devices} devices; "
@@ -72,6 +73,14 @@ def make_mesh(num_runs: int, num_worlds: int) -> Mesh | None:
         return None
     axes = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((runs, worlds), (RUNS_AXIS, WORLDS_AXIS), axes, devices=jax.devices()[: runs * worlds])
+
+
+def mesh_shape(num_runs: int, num_worlds: int, num_devices: int) -> tuple[int, int]:
+    """How many devices share the runs and, of each of these, how many its worlds: as many as divide both."""
+    shapes = [
+        (runs, math.gcd(num_worlds, num_devices // runs)) for runs in range(1, num_devices + 1) if num_runs % runs == 0
+    ]
+    return max(shapes, key=lambda shape: (math.prod(shape), shape))
 
 
 def place(batch: Batch, states: TrainState) -> TrainState:

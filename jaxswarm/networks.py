@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxswarm import sets
 from jaxswarm.aggregators import Mean
 from jaxswarm.distributions import Policy, gaussian
-from jaxswarm.types import Entities, Observation
+from jaxswarm.types import Entities, Observation, is_whole, require
 
 
 def leaky_relu(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -143,6 +143,14 @@ class ActorCritic(nn.Module):
     std: Literal["shared", "state"] = "shared"
     action_dim: int = 2
 
+    def __post_init__(self) -> None:
+        require(self, "tuples of whole numbers from 1", _is_widths, "encoder", "shared_encoder", "decoder")
+        require(self, "at least one layer, like [64]", lambda x: len(x) > 0, "encoder")
+        require(self, ", ".join(ACTIVATIONS), lambda x: x in ACTIVATIONS, "activation")
+        require(self, "separate, shared", lambda x: x in ("separate", "shared"), "latent_space")
+        require(self, "shared, state", lambda x: x in ("shared", "state"), "std")
+        super().__post_init__()
+
     def setup(self) -> None:  # noqa: D102
         layers = (self.encoder, self.shared_encoder, self.decoder, self.activation)
         self.actor, self.critic = (Tower(*layers, self.aggregator, self.latent_space) for _ in range(2))
@@ -176,6 +184,10 @@ class ActorCritic(nn.Module):
         """
         weights = self.actor.weights(*_flat(obs))
         return {name: x.reshape(*obs.own.shape[:-1], x.shape[-1]) for name, x in weights.items()}
+
+
+def _is_widths(value: Any) -> bool:
+    return isinstance(value, tuple) and all(map(is_whole(1), value))
 
 
 def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:

@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxswarm import curves, plots
 from jaxswarm.checkpoint import replace_text
+from jaxswarm.learners.on_policy import OnPolicy, batch_size
 
 RETURN = "eval/return"
 Row = dict[str, Any]  # a line of metrics.csv; empty cells are NaN
@@ -45,12 +46,14 @@ def manifest(experiment: Any, num_updates: int, seeds: Sequence[int]) -> dict[st
         "evaluations": math.ceil(num_updates / experiment.eval_every) + 1,
         "episodes_per_evaluation": experiment.eval_worlds,
     }
-    gradient_steps = experiment.learner.num_epochs * per_update // experiment.batch_size
-    steps |= {
-        "samples_per_gradient_step": experiment.batch_size,
-        "gradient_steps_per_update": gradient_steps,
-        "gradient_steps": num_updates * gradient_steps,
-    }
+    if isinstance(experiment.learner, OnPolicy):
+        size = batch_size(experiment.learner, per_update, experiment.task.num_agents)
+        gradient_steps = experiment.learner.num_epochs * per_update // size
+        steps |= {
+            "samples_per_gradient_step": size,
+            "gradient_steps_per_update": gradient_steps,
+            "gradient_steps": num_updates * gradient_steps,
+        }
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "command": sys.argv,

@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import math
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from jaxswarm import rollout
-from jaxswarm.learners.on_policy import LearnerState, batch_size
+from jaxswarm.learners.on_policy import LearnerState, OnPolicy, batch_size
 from jaxswarm.networks import ActorCritic
 from jaxswarm.rollout import PolicyFn, Worlds
 from jaxswarm.types import Key, Metrics, is_whole, pytree, require, static
@@ -25,7 +26,8 @@ class Experiment:
 
     Every `eval_every` updates, before the update, the deterministic policy plays one episode in each of `eval_worlds`
     separate worlds. With `desynchronised_start` each world begins at a random time of its first episode, so that
-    worlds do not move in lockstep. `reset_pool` start states are drawn per world and update.
+    worlds do not move in lockstep. `reset_pool` start states are drawn per world and update; `None`: as many as whole
+    episodes begin in `num_steps`. Worlds of a task that ends early may need more; they use theirs again.
     """
 
     task: Any
@@ -36,17 +38,19 @@ class Experiment:
     eval_worlds: int = static(default=20)
     eval_every: int = static(default=10)
     desynchronised_start: bool = static(default=True)
-    reset_pool: int = static(default=1)
+    reset_pool: int | None = static(default=None)
 
     def __post_init__(self) -> None:
-        sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every", "reset_pool")
+        sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every")
         require(self, "whole numbers from 1", is_whole(1), *sizes)
-        assert self.batch_size
+        require(self, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "reset_pool")
+        if isinstance(self.learner, OnPolicy):
+            batch_size(self.learner, self.agent_steps_per_update, self.task.num_agents)  # raises if it cannot be
 
     @property
-    def batch_size(self) -> int:
-        """Samples per gradient step; raises a `ValueError` where the learner's cannot be."""
-        return batch_size(self.learner, self.agent_steps_per_update, self.task.num_agents)
+    def num_start_states(self) -> int:
+        """Drawn per world and update."""
+        return self.reset_pool or math.ceil(self.num_steps / self.task.episode_length)
 
     @property
     def agent_steps_per_update(self) -> int:
@@ -120,7 +124,7 @@ def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[Tra
         _policy(experiment, state.learner),
         state.worlds,
         experiment.num_steps,
-        experiment.reset_pool,
+        experiment.num_start_states,
     )
     learner, learner_metrics = experiment.learner.update(
         learner_key, state.learner, experiment.network, experiment.task, trajectory

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Key = jax.Array  # a typed PRNG key
@@ -49,10 +50,10 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def require(owner: Any, accepted: str, is_accepted: Callable[[Any], bool], *names: str) -> None:
-    """Raises a `ValueError` that names the first wrong field; arrays and tracers are not judged."""
+    """Raises a `ValueError` that names the first wrong field; arrays, of JAX or NumPy, and tracers are not judged."""
     for name in names:
         value = getattr(owner, name)
-        if not isinstance(value, jax.Array) and not _holds(is_accepted, value):
+        if not isinstance(value, jax.Array | np.ndarray) and not _holds(is_accepted, value):
             raise ValueError(f"{name} = {value!r} is not possible; accepted: {accepted}")
 
 

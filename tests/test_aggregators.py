@@ -296,6 +296,19 @@ def test_precision_of_softplus_and_its_gradient_over_the_whole_range():
     np.testing.assert_allclose(gradient, -1 / (1 + np.exp(-np.float64(x))) / variance**2, rtol=1e-5, atol=1e-37)
 
 
+@pytest.mark.parametrize("rectifier", ["softplus", "exp"])
+@pytest.mark.parametrize("raw", [-1e30, -200.0, -88.0, 200.0, 1e30])
+def test_no_variance_is_too_extreme(rectifier, raw):
+    model = AGGREGATORS["bayesian"](rectifier=rectifier)
+    segments = segments_of(jnp.ones((1, 3), bool))
+    messages = jnp.array([[1.0, raw], [2.0, raw], [4.0, raw]])
+    params = model.init(jax.random.key(0), messages, segments)
+    output, gradient = jax.value_and_grad(lambda x: model.apply(params, x, segments).sum())(messages)
+    assert np.isfinite(output)
+    assert np.isfinite(gradient).all()
+    assert raw > 0 or output == pytest.approx(7 / 3, rel=1e-5)
+
+
 MASK = np.array([[True, False, True, True, False], [False] * SLOTS, [False, False, False, True, False]])
 
 

@@ -111,7 +111,7 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("network.encoder=64", ["64", "a list of integers"]),
         ("network.encoder=[a]", ["network.encoder[0]", "an integer"]),
         ("network.decoder=[64,0]", ["network.decoder = [64, 0]", "integers from 1"]),
-        ("network.encoder=[]", ["network.encoder = []", "at least one layer"]),
+        ("network.encoder=[]", ["encoder = ()", "at least one layer"]),
         ("task={a: 1}", ["task"]),
         ("foo", ["'foo'", "key=value"]),
         ("seed=1,2", ["'seed=1,2'", "one value"]),

@@ -158,6 +158,28 @@ def train(num_runs):
 """
 
 
+@pytest.mark.parametrize(
+    ("num_runs", "num_worlds", "num_devices", "shape"),
+    [
+        (4, 32, 2, (2, 1)),
+        (1, 32, 8, (1, 8)),
+        (3, 32, 2, (1, 2)),
+        (8, 32, 12, (8, 1)),
+        (10, 32, 12, (10, 1)),
+        (1, 7, 2, (1, 1)),
+    ],
+)
+def test_as_many_devices_as_possible_are_used(num_runs, num_worlds, num_devices, shape):
+    assert ensemble.mesh_shape(num_runs, num_worlds, num_devices) == shape
+
+
+def test_numbers_of_a_batch_may_be_arrays():
+    rates = [np.array([1e-3, 2e-3]), np.array([3e-3, 4e-3])]
+    experiments = [EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=x)) for x in rates]
+    found = ensemble.make_batch(experiments, 2).experiments.learner.learning_rate
+    np.testing.assert_array_equal(found, np.float32([rates[0], rates[0], rates[1], rates[1]]))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("num_runs", "mesh"), [(8, (8, 1)), (2, (2, 4)), (1, (1, 4))])
 def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):

@@ -1,5 +1,6 @@
 """Networks reproduce recorded outputs, have the documented sizes and initial weights."""
 
+import re
 from functools import partial
 
 import jax
@@ -201,6 +202,18 @@ def test_leading_axes_are_free():
     other_policy, other_value = model.apply(tree, reshaped)
     np.testing.assert_allclose(other_policy.mean().reshape(6, 2), policy.mean(), atol=1e-6)
     np.testing.assert_allclose(other_value.reshape(6), value, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "accepted"),
+    [
+        ("encoder", (), "at least one layer"),
+        ("encoder", (8, 0), "tuples of whole numbers from 1"),
+    ],
+)
+def test_impossible_options_are_named(field, value, accepted):
+    with pytest.raises(ValueError, match=re.escape(f"{field} = {value!r} is not possible; accepted: {accepted}")):
+        ActorCritic(**{field: value})
 
 
 def test_equal_networks_are_equal_as_compilation_keys():

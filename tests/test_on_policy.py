@@ -44,13 +44,23 @@ def test_advantages_are_sums_of_temporal_differences(seed, discount, gae_lambda)
 ADVANTAGES = jax.jit(on_policy.generalized_advantages)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(1, 7), (4, 1), (2, 8), (164, 1000), (3, 5)])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 7), (4, 1), (2, 8), (164, 1000), (3, 5), (100, 1), (50, 3)])
 def test_shuffling_is_a_permutation(rows, columns):
     order = on_policy.shuffled(jax.random.key(0), rows, columns)
     np.testing.assert_array_equal(np.sort(order.reshape(-1)), np.arange(rows * columns))
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(2, 16), (16, 16), (40, 10)])
+@pytest.mark.parametrize(("rows", "columns"), [(100, 1), (100, 2), (40, 10), (32, 8)])
+def test_neighbours_do_not_follow_each_other(rows, columns):
+    """In time, that is: sample i + 1 is in the minibatch after that of sample i as often as any other."""
+    keys = jax.random.split(jax.random.key(2), 500)
+    order = jax.jit(jax.vmap(lambda key: on_policy.shuffled(key, rows, columns)))(keys).reshape(500, -1)
+    minibatch = np.argsort(np.asarray(order), axis=1) // columns
+    follows = (np.diff(minibatch, axis=1) == 1).mean()
+    assert follows == pytest.approx((rows - 1) / rows**2 * (rows * columns) / (rows * columns - 1), rel=0.15)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(2, 16), (16, 16), (40, 10), (100, 1)])
 def test_every_sample_is_as_likely_in_every_minibatch(rows, columns):
     num_draws = 2000
     keys = jax.random.split(jax.random.key(1), num_draws)
@@ -153,6 +163,21 @@ def test_statistics_are_those_of_the_rows_that_exist():
 def test_the_batch_size_nearest_to_the_usual_one_is_chosen(num_agents, batch_size):
     learner = LEARNERS["ppo"]()
     assert on_policy.batch_size(learner, 32 * 128 * num_agents, num_agents) == batch_size
+
+
+def test_without_samples_for_a_minibatch_there_is_a_clear_error():
+    with pytest.raises(ValueError, match=r"batch_size = None is not possible; .* = 1 that .*, for instance none"):
+        on_policy.batch_size(LEARNERS["ppo"](), 1, 1)
+
+
+def test_targets_without_variance_leave_nothing_to_explain():
+    assert np.isnan(on_policy.explained_variance(jnp.array([0.0, 1.0]), jnp.array([2.0, 2.0]), None))
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_hyper_parameters_may_be_arrays(learner):
+    rates = np.logspace(-4, -2, 3)
+    np.testing.assert_array_equal(LEARNERS[learner](learning_rate=rates).learning_rate, rates)
 
 
 @pytest.mark.parametrize("learner", LEARNERS)

@@ -117,6 +117,18 @@ def test_recorded_roots_in_double_precision(meta):
     np.testing.assert_array_less(error, 1e-9)
 
 
+@pytest.mark.parametrize("bound", [1.0, 2.0, 10.0, 30.0])
+def test_large_bounds_are_met_too(bound):
+    rng = np.random.default_rng(5)
+    with jax.enable_x64(True):
+        old_std = jnp.exp(jnp.asarray(rng.normal(size=(500, 3))))
+        std = old_std * jnp.exp(jnp.asarray(rng.choice([1.0, 4.0], (500, 1)) * rng.normal(size=(500, 3))))
+        projected = PROJECTIONS["kl"].project_std(std, old_std, jnp.float64(bound))
+    before, after = (cov_distance("kl", np.asarray(x), np.asarray(old_std)) for x in (std, projected))
+    assert (before > bound).any()
+    np.testing.assert_allclose(after, np.minimum(before, bound), rtol=1e-7)
+
+
 def policies(least_std, largest_std, least_bound):
     """Rows of arguments of `project` with such standard deviations; changes and bounds are of any size."""
 

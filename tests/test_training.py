@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
+from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment, reporting
+from jaxswarm.learners.on_policy import LearnerState
 from jaxswarm.training import train_chunk
+from jaxswarm.types import pytree
 
 TASK = jaxswarm.make("rendezvous", num_agents=3, episode_length=6)
 NETWORK = ActorCritic(encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["bayesian"]())
@@ -127,6 +129,31 @@ def test_every_number_that_fixes_no_shape_can_be_swept():
 def test_impossible_sizes_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         EXPERIMENT.replace(**changes)
+
+
+def test_every_episode_of_an_update_has_a_start_of_its_own():
+    assert [EXPERIMENT.replace(num_steps=n, num_worlds=12 // n).num_start_states for n in (4, 6, 12)] == [1, 1, 2]
+    assert EXPERIMENT.replace(reset_pool=5).num_start_states == 5
+    with pytest.raises(ValueError, match="reset_pool = 0 is not possible; accepted: null, whole numbers from 1"):
+        EXPERIMENT.replace(reset_pool=0)
+
+
+def test_a_learner_needs_no_more_than_init_and_update():
+    """And none of what on-policy learners share."""
+
+    @pytree
+    class Idle:
+        def init(self, params):
+            return LearnerState(params, ())
+
+        def update(self, key, state, network, task, trajectory):
+            return state, {"loss": trajectory.reward.mean()}
+
+    experiment = EXPERIMENT.replace(learner=Idle())
+    state, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 2)
+    assert int(state.update) == 2
+    assert np.isfinite(metrics["learner/loss"]).all()
+    assert "gradient_steps" not in reporting.manifest(experiment, 2, [0])["steps"]
 
 
 @pytest.mark.slow

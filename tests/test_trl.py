@@ -191,6 +191,11 @@ def test_impossible_numbers_are_named(field, value):
         TRL(**{field: value})
 
 
+def test_the_entropy_of_a_policy_that_is_never_projected_cannot_be_controlled():
+    with pytest.raises(ValueError, match="entropy_control = 'equality' is not possible with objective = 'raw'"):
+        TRL(objective="raw", entropy_control="equality")
+
+
 def test_bounds_and_coefficient_can_be_swept():
     leaves = jax.tree.leaves(TRL(mean_bound=0.1, cov_bound=0.2, coefficient=0.3))
     assert {0.1, 0.2, 0.3} <= set(leaves)

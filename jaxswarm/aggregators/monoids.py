@@ -35,7 +35,15 @@ def _softplus_precision_jvp(primals: tuple, tangents: tuple) -> tuple:
     return precision, -precision * (precision * sigmoid) * dx
 
 
-PRECISION = {"softplus": softplus_precision, "exp": lambda x: jnp.exp(-x)}  # of what a rectifier makes of a number
+def _bounded(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Above where sums of precisions, and their products with messages, would overflow."""
+    return jnp.maximum(x, -60.0)
+
+
+PRECISION = {  # of what a rectifier makes of a number
+    "softplus": lambda x: softplus_precision(_bounded(x)),
+    "exp": lambda x: jnp.exp(-_bounded(x)),
+}
 
 
 class Mean(nn.Module):

@@ -21,6 +21,7 @@ Params = Any
 Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
 
 USUAL_BATCH_SIZE = 1280
+FEWEST_COLUMNS = 8  # that are shuffled without sorting
 
 
 @pytree
@@ -61,12 +62,12 @@ def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
     """Samples per gradient step; a `ValueError` says which sizes are possible if the one asked for is not."""
     asked = learner.batch_size
     nearest = nearest_batch_sizes(learner, num_samples, num_agents)
-    if asked is None or asked == nearest[0]:
+    if nearest and (asked is None or asked == nearest[0]):
         return nearest[0]
     unit = _unit(learner, num_agents)
     raise ValueError(
         f"batch_size = {asked} is not possible; accepted: divisors of num_worlds * num_steps * num_agents = "
-        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest[:4])))}"
+        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest[:4]))) or 'none'}"
     )
 
 
@@ -244,8 +245,11 @@ def shuffled(key: Key, num_rows: int, num_columns: int) -> Int[Array, "rows colu
     """The numbers below rows * columns in pseudo-random order: a Feistel network with random tables.
 
     Luby and Rackoff (1988) show why a few rounds suffice. Sorting, which is what `jax.random.permutation` does, took
-    a fifth of the time of an update on CPU; this takes less than a hundredth.
+    a fifth of the time of an update on CPU; this takes less than a hundredth. Rows of a few numbers are sorted: with
+    one column the rounds would only turn the order round, and there are not many rows of such minibatches.
     """
+    if num_columns < FEWEST_COLUMNS:
+        return jax.random.permutation(key, num_rows * num_columns).reshape(num_rows, num_columns)
     tables = jax.random.bits(key, (4, num_columns + num_rows)) >> 1
     row, column = jnp.divmod(jnp.arange(num_rows * num_columns), num_columns)
     for table in tables.astype(jnp.int32):
@@ -319,4 +323,5 @@ def explained_variance(value: Float[Array, "*rows"], target: Float[Array, "*rows
     def variance(x: Array) -> Array:
         return mean(jnp.square(x - mean(x, mask)), mask)
 
-    return 1.0 - variance(target - value) / variance(target)
+    total = variance(target)
+    return jnp.where(total > 0.0, 1.0 - variance(target - value) / total, jnp.nan)

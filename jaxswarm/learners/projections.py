@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxswarm.distributions import Policy, gaussian_with_std, mean_and_std
 
 NUM_STEPS = 5  # of the root finding of `kl`: 2 suffice for bounds up to 0.05, 4 up to 1
+NUM_STEPS_FAR = 12  # for larger bounds
 
 Bound = Float[Array, ""] | float
 
@@ -149,7 +150,7 @@ def project_std_kl(
     """The centred Gaussian of least divergence to the new one whose divergence to the old one is within the bound.
 
     Where it is outside, precisions are averaged: 1 / projected^2 = s / std^2 + (1 - s) / old_std^2, with s in (0, 1)
-    such that the divergence is the bound. For bounds up to 2, s is exact to nine digits or to rounding.
+    such that the divergence is the bound. For bounds up to 30, s is exact to nine digits or to rounding.
 
     The derivative is that of the implicit function, for `std` alone. In logarithms it is (I - t t' / t't) diag(w),
     where t = 1 - (projected / old_std)^2 is normal to the ball and w = s (projected / std)^2.
@@ -205,7 +206,8 @@ def _root(a: Float[Array, "dim *batch"], bound: Bound, is_near_one: Bool[Array, 
 
     low, high = _bracket(a, bound)
     start = jnp.where(is_near_one, high, 0.5 * (low + high))
-    return jnp.exp(jax.lax.fori_loop(0, NUM_STEPS, step, (low, high, start))[2])
+    num_steps = jnp.where(bound > 1.0, NUM_STEPS_FAR, NUM_STEPS)
+    return jnp.exp(jax.lax.fori_loop(0, num_steps, step, (low, high, start))[2])
 
 
 def _bracket(a: Float[Array, "dim *batch"], bound: Bound) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:

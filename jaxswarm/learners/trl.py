@@ -65,6 +65,11 @@ class TRL(OnPolicy):
             "entropy_schedule": tuple(ENTROPY_SCHEDULES),
         }.items():
             require(self, ", ".join(accepted), accepted.__contains__, name)
+        if self.objective == "raw" and self.entropy_control != "none":
+            raise ValueError(
+                f"entropy_control = {self.entropy_control!r} is not possible with objective = 'raw', whose policy is "
+                "never projected; accepted: none"
+            )
 
     @property
     def layer(self) -> Projection:
