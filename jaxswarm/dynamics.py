@@ -11,6 +11,7 @@ They move states of any world that has these fields, of all its agents:
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -44,6 +45,7 @@ class Acceleration:
     max_turn_acceleration: float = math.pi
     damping: float = 0.01  # lost velocity per sub-step
 
+    @partial(jax.jit, inline=True)  # so that steps outside of any other `jit` are fast, too
     def move(self, space: Space, state: Any, action: Float[Array, "agents 2"]) -> Any:
         """The state after 0.1 s; actions are clipped to [-1, 1]."""
         gain = jnp.clip(action, -1, 1) * _row(self.max_acceleration, self.max_turn_acceleration)
@@ -71,6 +73,7 @@ class Velocity:
     max_speed: float = 10.0  # world units / s
     max_turn_rate: float = math.pi  # rad / s
 
+    @partial(jax.jit, inline=True)  # so that steps outside of any other `jit` are fast, too
     def move(self, space: Space, state: Any, action: Float[Array, "agents 2"]) -> Any:
         """The state after 0.1 s, its velocity the commanded one; actions are clipped to [-1, 1]."""
         limit = _row(self.max_speed, self.max_turn_rate)
@@ -91,7 +94,7 @@ class Velocity:
 DYNAMICS = {"acceleration": Acceleration, "velocity": Velocity}
 
 
-def _row(linear: float, angular: float) -> Float[Array, "1 2"]:
+def _row(linear: Float[Array, ""] | float, angular: Float[Array, ""] | float) -> Float[Array, "1 2"]:
     return jnp.stack([jnp.asarray(linear), jnp.asarray(angular)])[None]
 
 

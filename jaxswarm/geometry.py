@@ -37,9 +37,9 @@ class Torus:
         return across - self.side * jnp.round(across / self.side)
 
     def confine(self, position: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-        """The same place in the square, for a point that left it by less than one side."""
-        position = jnp.where(position < 0, position + self.side, position)
-        return jnp.where(position > self.side, position - self.side, position)
+        """The same place in the square."""
+        is_inside = (position >= 0) & (position <= self.side)
+        return jnp.where(is_inside, position, position - self.side * jnp.floor(position / self.side))
 
     def slide(self, position: Float[Array, "*n 2"], path: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
         """The whole path: nothing is in its way."""

@@ -1,4 +1,8 @@
-"""Who is near whom: between all pairs of a swarm, or through a grid of cells in O(agents) time and memory."""
+"""Who is near whom: between all pairs of a swarm, or through a grid of cells.
+
+The grid takes O(agents) memory. Its time grows with the agents times those in the fullest cells, which are as wide as
+agents see: it is faster than all pairs only if that is a small part of the world and the swarm is spread out.
+"""
 
 import itertools
 import math
@@ -38,7 +42,8 @@ def neighborhood(
     radius = jnp.asarray(radius)
     if max_neighbors is None:
         return _all_pairs(space, position, is_present, radius, is_visible)
-    return _by_cells(space, jax.lax.stop_gradient(position), is_present, radius, is_visible, max_neighbors)
+    space, position, radius = jax.lax.stop_gradient((space, position, radius))
+    return _by_cells(space, position, is_present, radius, is_visible, max_neighbors)
 
 
 def _all_pairs(space: Space, position: Array, is_present: Array, radius: Array, is_visible: IsVisible) -> Neighborhood:

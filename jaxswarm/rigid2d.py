@@ -70,9 +70,16 @@ class _Program(NamedTuple):
 
 def _simulate(program: _Program, side: Array | float, state: Any, command: Array) -> Any:
     names = ("position", "heading", "box_position", "box_heading", "box_velocity")
-    arrays = [jnp.asarray(side, jnp.float32), command, state.box_present.astype(jnp.float32)]
-    moved = _worlds_last(program)(*arrays, *(getattr(state, name) for name in names))
+    dtype = state.position.dtype
+    arrays = [jnp.asarray(side, dtype), command, state.box_present.astype(dtype)]
+    moved = _compiled(program, *arrays, *(getattr(state, name) for name in names))
     return state.replace(**dict(zip(names, moved, strict=True)))
+
+
+@partial(jax.jit, static_argnames="program", inline=True)
+def _compiled(program: _Program, *arrays: Array) -> tuple[Array, ...]:
+    """Once for each program, so that steps outside of any `jit` are fast, too."""
+    return _worlds_last(program)(*arrays)
 
 
 def _worlds_last(program: _Program) -> Callable:

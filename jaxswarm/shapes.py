@@ -79,7 +79,7 @@ def _pairs(like: Float[Array, "bodies *worlds"]) -> tuple[Array, Array]:
 
 def _table(values: np.ndarray, like: Array) -> Array:
     """Numbers for each pair of bodies in all worlds, those of `like`, [bodies, *worlds]."""
-    return jnp.asarray(values.reshape(*values.shape, *[1] * (like.ndim - 1)), jnp.float32)
+    return jnp.asarray(values.reshape(*values.shape, *[1] * (like.ndim - 1)), like.dtype)
 
 
 def _bias(solver: Solver, gap: Array, recovery: float) -> Array:

@@ -1,6 +1,7 @@
 """The few data types that every floor shares."""
 
 import dataclasses
+import numbers
 from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
@@ -53,7 +54,8 @@ def require(owner: Any, accepted: str, is_accepted: Callable[[Any], bool], *name
     """Raises a `ValueError` that names the first wrong field; arrays, of JAX or NumPy, and tracers are not judged."""
     for name in names:
         value = getattr(owner, name)
-        if not isinstance(value, jax.Array | np.ndarray) and not _holds(is_accepted, value):
+        is_array = isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.ndim > 0)
+        if not is_array and not _holds(is_accepted, value):
             raise ValueError(f"{name} = {value!r} is not possible; accepted: {accepted}")
 
 
@@ -66,7 +68,7 @@ def _holds(is_accepted: Callable[[Any], bool], value: Any) -> bool:
 
 def is_whole(least: int) -> Callable[[Any], bool]:
     """Accepts integers from `least`."""
-    return lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= least
+    return lambda value: isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= least
 
 
 @pytree

@@ -109,6 +109,14 @@ def test_random_directions_are_those_of_voronoi_cells(torus):
     assert (np.array(expected) == 0).all(-1).any()
 
 
+@pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-16, 1e-14, 1e-3])
+def test_no_pursuer_is_too_close(distance):
+    room = jnp.ones((1,), bool)
+    way = np.asarray(flight(Plane(100.0), jnp.zeros(2), jnp.array([[distance, 0.0]]), room, 50.0))
+    assert np.isfinite(way).all()
+    assert np.linalg.norm(way) == pytest.approx(float(distance > 1e-15), abs=1e-6)
+
+
 def test_a_lone_pursuer_in_the_middle_is_fled_straight_away():
     pursuers = jnp.zeros((ROOM, 2)).at[0].set(jnp.array([50.0, 40.0]))
     away = flights(False, *(jnp.array([x]) for x in (100.0, [50.0, 60.0], pursuers, 1, 30.0)))[0]

@@ -71,6 +71,11 @@ def test_walls_stop_where_the_torus_goes_on_at_the_other_side(position):
     np.testing.assert_array_equal(np.mod(Torus(SIDE).confine(position), SIDE), np.mod(position, SIDE))
 
 
+def test_points_far_beyond_the_seam_come_back_too():
+    position = jnp.array([[5.4, -7.9], [1.0, 0.0], [-0.25, 1.25]])
+    np.testing.assert_allclose(Torus(1.0).confine(position), [[0.4, 0.1], [1.0, 0.0], [0.75, 0.25]], atol=1e-6)
+
+
 def test_exactly_one_side_is_not_wrapped():
     edge = jnp.array([SIDE, 0.0])
     np.testing.assert_array_equal(Torus(SIDE).confine(edge), edge)

@@ -87,6 +87,17 @@ def test_absent_agents_surround_nobody():
         jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:20], b[:20]), one, two)
 
 
+def test_derivatives_by_radius_and_side_pass_the_grid_by():
+    def spread(numbers, max_neighbors):
+        radius, side = numbers
+        position, is_present = jnp.array([[1.0, 1.0], [2.0, 2.0]]), jnp.ones(2, bool)
+        return neighborhood(Torus(side), position, is_present, radius, lambda x: x < radius, max_neighbors).spread.sum()
+
+    gradients = [jax.grad(spread)((3.0, 10.0), max_neighbors) for max_neighbors in (None, 1)]
+    np.testing.assert_array_equal(gradients[1], 0.0)
+    assert np.isfinite(gradients[0]).all()
+
+
 def test_memory_grows_with_the_number_of_agents():
     """Of the compiled program, without running it: 10 000 agents would need 400 MB for every matrix of pairs."""
     position = jax.ShapeDtypeStruct((10_000, 2), jnp.float32)

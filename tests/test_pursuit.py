@@ -266,8 +266,8 @@ def test_the_order_of_agents_and_evaders_does_not_matter():
     [
         ("num_agents", 0, "whole numbers from 1"),
         ("num_evaders", 0, "whole numbers from 1"),
-        ("evader_visibility_radius", 0.0, "positive numbers"),
-        ("visibility_radius", -1.0, "positive numbers"),
+        ("evader_visibility_radius", 0.0, "positive finite numbers"),
+        ("visibility_radius", -1.0, "positive finite numbers"),
         ("reward", "min_distance", "distance, catches"),
         ("max_neighbors", 0, "null, whole numbers from 1"),
         ("active_agents", (3, 2), r"null, a pair \(low, high\) from 1 to 10"),

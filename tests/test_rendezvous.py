@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from jaxswarm.geometry import bearing, direction, norm, unit
+from jaxswarm.neighbors import Neighborhood
 from jaxswarm.tasks.rendezvous import Rendezvous, State
 
 GOLDEN = np.load(pathlib.Path(__file__).parent / "golden" / "rendezvous.npz")
@@ -215,6 +216,18 @@ def test_the_reward_is_the_mean_distance_and_a_price_of_action(num_agents):
     np.testing.assert_allclose(outcome.metrics["distance"], np.minimum(distance, 50).mean(), rtol=1e-5)
 
 
+def test_a_swarm_of_more_agents_than_pairs_can_be_counted():
+    """50 000 agents have 2.5e9 ordered pairs, and int32 ends at 2.1e9; only what scales with the pairs is computed."""
+    spread = jnp.full(50_000, 50_000.0)
+    task = Rendezvous(num_agents=50_000)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Rendezvous, "around", lambda self, state: Neighborhood(jnp.zeros(50_000, jnp.int32), spread, None)
+        )
+        _, outcome = task.step(KEY, task.reset(KEY), jnp.zeros((50_000, 2)))
+    np.testing.assert_allclose(outcome.reward, -1 / task.visibility_radius, rtol=1e-3)
+
+
 def test_starts_are_uniform_and_at_rest():
     states = jax.vmap(Rendezvous(side=60.0).reset)(jax.random.split(KEY, 500))
     assert 3 <= states.position.min() < 3.1
@@ -265,9 +278,10 @@ def test_driving_to_the_first_centroid_scores_ten_to_sixteen():
         ("num_agents", 1, "whole numbers from 2"),
         ("num_agents", 2.5, "whole numbers from 2"),
         ("episode_length", 0, "whole numbers from 1"),
-        ("side", 0.0, "positive numbers"),
-        ("visibility_radius", -1, "positive numbers"),
-        ("visibility_radius", float("nan"), "positive numbers"),
+        ("side", 0.0, "positive finite numbers"),
+        ("visibility_radius", -1, "positive finite numbers"),
+        ("visibility_radius", float("nan"), "positive finite numbers"),
+        ("visibility_radius", float("inf"), "positive finite numbers"),
         ("dynamics", "unicycle", "acceleration, velocity"),
         ("relative_velocity", "times 5", "normalised, thesis"),
         ("torus", "yes", "True, False"),

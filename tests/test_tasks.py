@@ -15,6 +15,7 @@ KEY = jax.random.key(1)
 VARIANTS = {
     "as they are": {},
     "numbers vary, nearest only": {"active_agents": (2, 3), "max_neighbors": 2, "visibility_radius": 60.0},
+    "boxes vary": {"active_boxes": (1, 3)},
 }
 
 
@@ -74,6 +75,35 @@ def test_states_keep_their_shapes_and_types(task):
     assert describe(after) == describe(state)
     assert state.time == 0
     assert after.time == 1
+
+
+def test_in_double_precision_states_keep_their_types_too(task):
+    with jax.enable_x64(True):
+        start, (after, outcome), obs = jax.eval_shape(
+            lambda key, action: (state := task.reset(key), task.step(key, state, action), task.observe(state)),
+            KEY,
+            jax.ShapeDtypeStruct((NUM_AGENTS, task.action_dim), jnp.float64),
+        )
+    assert describe(after) == describe(start)
+    assert start.position.dtype == outcome.reward.dtype == obs.own.dtype == jnp.float64
+
+
+@pytest.mark.slow
+def test_steps_outside_of_any_program_compile_once(task):
+    """But the grid of cells: it is for swarms that nobody steps like this."""
+    if getattr(task, "max_neighbors", None):
+        pytest.skip("lists of the nearest compile at every step outside of a program")
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **_: compiled.append(event) if "backend_compile" in event else None
+    )
+    state, action = task.reset(KEY), jnp.zeros((NUM_AGENTS, task.action_dim))
+    jax.jit(lambda x: x + len(compiled))(1)
+    assert compiled  # the listener hears of programs
+    state, _ = task.step(KEY, state, action)
+    compiled.clear()
+    task.step(KEY, state, action)
+    assert not compiled
 
 
 def test_steps_are_scalars(task):

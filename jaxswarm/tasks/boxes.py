@@ -77,7 +77,7 @@ class Assembly:
         after = self.arena.move(state, action)
         before_distance, after_distance = _pairs(state.box_position), _pairs(after.box_position)
         is_pair = state.box_present[:, None] & state.box_present[None] & ~jnp.eye(self.num_boxes, dtype=bool)
-        is_over = after.time >= self.episode_length
+        is_over = jnp.asarray(after.time >= self.episode_length)
         step = Step(
             reward=jnp.where(is_pair, before_distance - after_distance, 0).sum() / 2,
             terminated=jnp.array(False),
@@ -168,7 +168,7 @@ class Clustering:
         }
         if self.reward == "corners":
             metrics["corner_distance"] = _mean(_to_corners(self, after.box_position), after.box_present)
-        is_over = after.time >= self.episode_length
+        is_over = jnp.asarray(after.time >= self.episode_length)
         step = Step(
             reward=REWARDS[self.reward](self, state, after),
             terminated=jnp.array(False),

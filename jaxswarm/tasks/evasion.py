@@ -1,5 +1,7 @@
 """Where an evader flees: as the Voronoi edge that it shares with the nearest pursuer tells (Zhou et al., 2016)."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -9,6 +11,7 @@ from jaxswarm.geometry import Space, Torus, norm, unit
 MAX_SEEN = 10  # pursuers that an evader heeds, on a torus copies of pursuers
 
 
+@partial(jax.jit, inline=True)  # so that steps outside of any other `jit` are fast, too
 def flight(
     space: Space,
     evader: Float[Array, "2"],
@@ -26,7 +29,7 @@ def flight(
 
     A torus is taken as in the thesis's program: the evader's copy nearest the middle of the square of 2 x 2 worlds, in
     which each pursuer has four copies. Pursuers at one distance count as one of the 10. Zero if nobody is in sight, or
-    a pursuer is at the evader's very place.
+    a pursuer is at the evader's very place, or closer than 1e-15.
     """
     x, y, low, high = _surroundings(space, evader, pursuers)
     square = jax.lax.stop_gradient(x * x + y * y)
@@ -34,7 +37,7 @@ def flight(
     square = jnp.where(is_near, square, jnp.inf)
     index = jnp.arange(len(x))
     nearest = jnp.where(square == square.min(), index, len(x)).min()  # on CPU much faster than `argmin`
-    is_fleeing = (square.min() > 0) & (square.min() < jnp.inf)
+    is_fleeing = (square.min() > 1e-30) & (square.min() < jnp.inf)
     xi = jnp.where(is_fleeing, jnp.stack([x[nearest], y[nearest]]), 1.0)
     h = unit(xi, norm(xi))
     v = jnp.stack([-h[1], h[0]])
@@ -55,8 +58,8 @@ def _surroundings(space: Space, evader: Array, pursuers: Array) -> tuple[Array, 
     if not isinstance(space, Torus):
         return x, y, -evader, space.side - evader
     shift = jnp.where(evader < space.side / 2, space.side, 0.0)
-    x = x[None] + (space.side * jnp.array([0.0, 1.0, 0.0, 1.0]) - shift[0])[:, None]
-    y = y[None] + (space.side * jnp.array([0.0, 0.0, 1.0, 1.0]) - shift[1])[:, None]
+    x = x[None] + (space.side * jnp.array([0.0, 1.0, 0.0, 1.0], x.dtype) - shift[0])[:, None]
+    y = y[None] + (space.side * jnp.array([0.0, 0.0, 1.0, 1.0], x.dtype) - shift[1])[:, None]
     return x.reshape(-1), y.reshape(-1), -evader - shift, 2 * space.side - evader - shift
 
 

@@ -27,7 +27,7 @@ class State:
     """One world."""
 
     position: Float[Array, "agents 2"]  # world units, in [0, side]
-    heading: Float[Array, "agents"]  # rad, counter-clockwise from x, of any number of turns
+    heading: Float[Array, "agents"]  # rad, counter-clockwise from x
     velocity: Float[Array, "agents 2"]  # linear speed in world units / s, turn rate in rad / s
     rounding: Float[Array, "agents 5"]  # see `dynamics`
     evader_position: Float[Array, "evaders 2"]
@@ -63,7 +63,7 @@ class Pursuit:
     unit) ends the episode. With `"catches"` every evader caught (at 2 units) gives 1 and starts anew somewhere else.
     Evaders flee from those that they see within `evader_visibility_radius`, which is also how far they are seen.
     Numbers of agents and evaders are drawn for each episode within `active_agents` and `active_evaders`, if given.
-    With `max_neighbors` agents perceive their nearest neighbours only, and perceiving takes O(num_agents).
+    With `max_neighbors` agents perceive their nearest neighbours only, in O(num_agents) memory (see `neighbors`).
     """
 
     num_agents: int = static(default=10)
@@ -84,7 +84,7 @@ class Pursuit:
         swarm.require_swarm(self, least=1)
         require(self, "whole numbers from 1", is_whole(1), "num_evaders")
         swarm.require_range(self, "active_evaders", 1, self.num_evaders)
-        require(self, "positive numbers", lambda x: x > 0, "evader_visibility_radius")
+        require(self, "positive finite numbers", lambda x: 0 < x < math.inf, "evader_visibility_radius")
         require(self, ", ".join(CATCH_DISTANCE), lambda x: x in CATCH_DISTANCE, "reward")
 
     @property
@@ -125,14 +125,14 @@ class Pursuit:
         if self.reward == "catches":
             caught, age = self.is_caught(state), state.evader_age
             state = self._move(self._restart(key, state, caught), action)
-            reward, is_solved = caught.sum().astype(jnp.float32), jnp.array(False)
+            reward, is_solved = caught.sum(dtype=state.position.dtype), jnp.array(False)
         else:
             state = self._move(state, action)
             caught, age = self.is_caught(state), state.evader_age
             smallest = jnp.minimum(self.distances(state).min(), self.evader_visibility_radius)
             reward, is_solved = -smallest / self.evader_visibility_radius, caught.any()
         state = dataclasses.replace(state, catches=state.catches + caught.sum(dtype=jnp.int32))
-        is_over = state.time >= self.episode_length
+        is_over = jnp.asarray(state.time >= self.episode_length)
         metrics = self._metrics(state, is_solved | is_over, is_solved)
         metrics["capture_time"] = jnp.where(caught, age, 0).sum() / jnp.where(caught.any(), caught.sum(), jnp.nan)
         return state, Step(reward, is_solved, is_over & ~is_solved, metrics)
@@ -190,9 +190,10 @@ class Pursuit:
     def view(self, state: State) -> View:
         """What `perceive` needs of a state, in O(agents) memory."""
         around = self.around(state)
-        own = [around.num_visible / jnp.maximum(state.active_agents - 1, 1)]
+        dtype = state.position.dtype
+        own = [around.num_visible.astype(dtype) / jnp.maximum(state.active_agents - 1, 1)]
         if not self.torus:
-            own.append(((state.position <= WALL_LOW) | (state.position >= WALL_HIGH)).any(-1).astype(jnp.float32))
+            own.append(((state.position <= WALL_LOW) | (state.position >= WALL_HIGH)).any(-1).astype(dtype))
         agents = Agents(state.position, direction(state.heading), jnp.stack(own, -1))
         return View(agents, state.active_agents, around.nearest, state.evader_position, state.active_evaders)
 

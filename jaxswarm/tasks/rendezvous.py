@@ -26,7 +26,7 @@ class State:
     """One world."""
 
     position: Float[Array, "agents 2"]  # world units, in [0, side]
-    heading: Float[Array, "agents"]  # rad, counter-clockwise from x, of any number of turns
+    heading: Float[Array, "agents"]  # rad, counter-clockwise from x
     velocity: Float[Array, "agents 2"]  # linear speed in world units / s, turn rate in rad / s
     rounding: Float[Array, "agents 5"]  # see `dynamics`
     active_agents: Int[Array, ""]  # the first ones take part; the others do not exist
@@ -49,7 +49,8 @@ class Rendezvous:
     """The rendezvous of the thesis (section 5.2.2); its figures used the defaults, but "thesis" relative velocities.
 
     With `active_agents` the number of agents of each episode is drawn between these two; `num_agents` is then the most
-    there can be. With `max_neighbors` agents perceive their nearest neighbours only, and a step takes O(num_agents).
+    there can be. With `max_neighbors` agents perceive their nearest neighbours only, in O(num_agents) memory (see
+    `neighbors`).
     """
 
     num_agents: int = static(default=20)
@@ -101,10 +102,11 @@ class Rendezvous:
         state = self.motion.move(self.space, state, action).replace(time=state.time + 1)
         is_present = swarm.is_present(state.active_agents, self.num_agents)
         around = self.around(state)
-        num_pairs = state.active_agents * (state.active_agents - 1)
+        num_agents = jnp.asarray(state.active_agents, state.position.dtype)
+        num_pairs = num_agents * jnp.maximum(num_agents - 1, 1)  # ordered
         distance = jnp.where(is_present, around.spread, 0.0).sum() / num_pairs
         effort = jnp.where(is_present[:, None], jnp.square(action), 0.0).sum() / (2 * state.active_agents)
-        is_over = state.time >= self.episode_length
+        is_over = jnp.asarray(state.time >= self.episode_length)
         step = Step(
             reward=-distance / self.visibility_radius - 0.001 * effort,
             terminated=jnp.array(False),
@@ -135,7 +137,7 @@ class Rendezvous:
             direction=direction(state.heading),
             velocity=self.motion.world_velocity(state.heading, state.velocity),
             num_visible=num_visible,
-            own=jnp.concatenate([num_visible / (state.active_agents - 1), feeling], -1),
+            own=jnp.concatenate([num_visible / jnp.maximum(state.active_agents - 1, 1), feeling], -1),
         )
         return View(agents, state.active_agents, around.nearest)
 

@@ -1,5 +1,6 @@
 """What swarms of points have in common: how many take part, where they start, and who each of them looks at."""
 
+import math
 from typing import Any
 
 import jax
@@ -27,7 +28,7 @@ def require_swarm(task: Any, least: int) -> None:
     require(task, f"whole numbers from {least}", is_whole(least), "num_agents")
     require(task, "whole numbers from 1", is_whole(1), "episode_length")
     require(task, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "max_neighbors")
-    require(task, "positive numbers", lambda x: x > 0, "side", "visibility_radius")
+    require(task, "positive finite numbers", lambda x: 0 < x < math.inf, "side", "visibility_radius")
     require(task, "True, False", lambda x: isinstance(x, bool), "torus")
     require_range(task, "active_agents", least, task.num_agents)
 
@@ -69,7 +70,7 @@ def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_ne
     if max_neighbors is None:
         return {}
     missed = jnp.maximum(neighborhood.num_visible - max_neighbors, 0)
-    return {"unseen_neighbors": jnp.where(present, missed, 0).sum() / present.sum()}
+    return {"unseen_neighbors": jnp.where(present, missed, 0.0).sum() / present.sum()}
 
 
 def after(agent: Int[Array, ""], num_agents: int) -> Int[Array, " others"]:
