@@ -1,6 +1,7 @@
 """Claims about learning curves: a number that follows from them, and the range in which it has to be.
 
-Curves are medians over seeds, measured as the thesis measured its own, and the same number is computed of both.
+Curves are medians over seeds, measured as the thesis measured its own, and the same number is computed of both. How
+certain a number is follows from redrawing the seeds (bootstrap): a verdict takes that nine of ten redrawings agree.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from jaxswarm.curves import Line, Points
 LAST = 0.1  # share of a curve that makes up its final level
 SMOOTHED = 5  # evaluations, centred, before it is asked when a curve reaches a level
 TOLERANCE = 1e-3  # share of a curve that may be missing at its end
+CERTAINTY = 0.9  # share of redrawings that have to agree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,16 +25,25 @@ class Measured:
     line: Line
     reference: Line
     end: float  # agent steps where the last tenth is over
+    redrawn: tuple[Line, ...] = ()  # the same of seeds drawn from these, with replacement
 
     @property
     def is_cut(self) -> bool:
         """Whether the series ends before it should."""
-        return bool(self.line.x[-1] < (1 - TOLERANCE) * self.end)
+        return self.is_cut_before(self.end)
 
     @property
     def num_seeds(self) -> int:
         """Those that have reached the end."""
-        return int(np.interp(self.end, self.line.x, self.line.num_seeds))
+        return self.num_seeds_at(self.end)
+
+    def is_cut_before(self, steps: float) -> bool:
+        """Whether the series ends before so many agent steps."""
+        return bool(self.line.x[-1] < (1 - TOLERANCE) * steps)
+
+    def num_seeds_at(self, steps: float) -> int:
+        """Those that have come so far."""
+        return int(np.interp(steps, self.line.x, self.line.num_seeds))
 
     def final(self, values: Points | None = None) -> float:
         """Mean over the last tenth: of the median, or of a quartile."""
@@ -66,6 +77,13 @@ class Claim:
         """What the claim is about; NaN where a series never gets there."""
         return KINDS[self.kind](self, [series[name] for name in self.series])
 
+    def needs(self, one: Measured) -> float:
+        """Up to how many agent steps the claim looks at a series."""
+        if not math.isnan(self.at):
+            return self.at
+        reached = math.nan if math.isnan(self.fraction) else one.steps_to(self.fraction)
+        return one.end if math.isnan(reached) else reached
+
     def holds(self, number: float) -> bool:
         """Whether it is in the range; NaN never is."""
         return bool(self.low <= number <= self.high)
@@ -80,22 +98,36 @@ class Verdict:
     here: float
     thesis: float
     num_seeds: int
+    interval: tuple[float, float] = (math.nan, math.nan)  # of the number here, in four of five redrawings
 
 
 def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measured], enough: int) -> Verdict:
-    """The verdict, which takes `enough` seeds of every series, trained to their end."""
+    """The verdict, which takes `enough` seeds of every series, trained as far as the claim looks, that agree."""
     thesis = claim.number(theirs) if theirs.keys() >= set(claim.series) else math.nan
-    num_seeds = min(ours[name].num_seeds if name in ours else 0 for name in claim.series)
     if not ours.keys() >= set(claim.series):
         return Verdict(claim, "not enough runs", math.nan, thesis, 0)
-    here = claim.number(ours)
-    if any(ours[name].is_cut for name in claim.series):
+    series = [ours[name] for name in claim.series]
+    here, redrawn = claim.number(ours), _redrawn(claim, ours)
+    num_seeds = min(one.num_seeds_at(claim.needs(one)) for one in series)
+    if any(one.is_cut_before(claim.needs(one)) for one in series):
         outcome = "run was cut"
-    elif num_seeds < enough:
+    elif num_seeds < enough or np.mean([claim.holds(x) == claim.holds(here) for x in [here, *redrawn]]) < CERTAINTY:
         outcome = "not enough runs"
     else:
         outcome = "reproduced" if claim.holds(here) else "not reproduced"
-    return Verdict(claim, outcome, here, thesis, num_seeds)
+    numbers = np.nan_to_num(redrawn, nan=math.inf)  # steps to where it never gets
+    low, high = np.percentile(numbers, [10, 90], method="nearest") if redrawn else (math.nan, math.nan)
+    return Verdict(claim, outcome, here, thesis, num_seeds, (float(low), float(high)))
+
+
+def _redrawn(claim: Claim, series: Mapping[str, Measured]) -> list[float]:
+    """The claim's number in every redrawing of the seeds of all its series."""
+    count = min(len(series[name].redrawn) for name in claim.series)
+
+    def draw(number: int) -> dict[str, Measured]:
+        return {name: dataclasses.replace(series[name], line=series[name].redrawn[number]) for name in claim.series}
+
+    return [claim.number(draw(number)) for number in range(count)]
 
 
 def _final(x: Points, values: Points, end: float) -> float:
@@ -128,7 +160,8 @@ def _lead(claim: Claim, series: Sequence[Measured]) -> float:
 
 def _pace(claim: Claim, series: Sequence[Measured]) -> float:
     first, second = (one.steps_to(claim.fraction) for one in series)
-    return first / second
+    first, second = (math.inf if math.isnan(steps) else steps for steps in (first, second))  # never
+    return first / second  # NaN if both are infinite
 
 
 KINDS: dict[str, Callable[[Claim, Sequence[Measured]], float]] = {

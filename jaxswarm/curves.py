@@ -94,6 +94,23 @@ def summarize(curves: Sequence[Curve], statistic: str) -> Line:
     return Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(values), axis=0))
 
 
+def redrawn(curves: Sequence[Curve], statistic: str, count: int) -> list[Line]:
+    """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of all seeds."""
+    grid, values = on_common_grid(curves)
+    rng = np.random.default_rng(0)
+    of_all = STATISTICS[statistic].compute(values)
+    lines = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of points without any seed
+        for _ in range(count):
+            drawn = values[rng.integers(len(values), size=len(values))]
+            points = STATISTICS[statistic].compute(drawn)
+            is_there = ~np.isnan(drawn).all(axis=0)
+            y, lower, upper = (np.where(is_there, x, other) for x, other in zip(points, of_all, strict=True))
+            lines.append(Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(drawn), axis=0)))
+    return lines
+
+
 def profile(finals: Float[np.ndarray, " seeds"], at: Points) -> Line:
     """Performance profile: the fraction of seeds that end above each value (Agarwal et al., 2021, eq. 1).
 

@@ -28,6 +28,7 @@ from jaxswarm.sweep import Trial
 
 CURVES = Path(__file__).resolve().parent / "data" / "curves"  # of the thesis
 FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables
+NUM_REDRAWN = 200  # times that seeds are redrawn, to see how certain a claim is
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,16 +90,16 @@ def plan(
     num_seeds: int | None = None,
     scale: float = 1.0,
     words: Sequence[str] = (),
-) -> dict[str, Trial]:
-    """The trial of each series, in the folder that was found to have its experiment and seeds, or else in a new one.
+) -> dict[str, list[Trial]]:
+    """The trials of each series: those in folders that were found to hold some of its seeds, and new ones for the rest.
 
-    It is `scale` times as long as what the figure shows of it; `words` change all series.
+    They are `scale` times as long as what the figure shows of it; `words` change all series.
     """
     wanted = {
         series: _cut(figure, [*own, *words], num_seeds or figure.num_seeds, scale)
         for series, own in figure.series.items()
     }
-    return {series: _trial(config, directory, found) for series, config in wanted.items()}
+    return {series: _trials(config, directory, found) for series, config in wanted.items()}
 
 
 def is_finished(trial: Trial) -> bool:
@@ -109,24 +110,42 @@ def is_finished(trial: Trial) -> bool:
 
 
 def measure(
-    figure: Figure, trials: Mapping[str, Trial], found: Sequence[RunFolder], warn: Callable[[str], object]
+    figure: Figure, trials: Mapping[str, Sequence[Trial]], found: Sequence[RunFolder], warn: Callable[[str], object]
 ) -> dict[str, Measured]:
     """What all seeds of the figure's series came to that any run holds; series without any are left out.
 
     As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
     """
     measured = {}
-    for series, trial in trials.items():
+    for series, (trial, *_) in trials.items():
         per_update = trial.experiment.agent_steps_per_update
-        fields, end = runs.fields(trial.config), float(figure.num_updates * per_update)
-        same = [folder for folder in found if folder.config == fields]
-        seeds = runs.seeds(same, "agent_steps", RETURN, warn) if any(folder.rows for folder in same) else []
+        end = float(figure.num_updates * per_update)
+        same = [folder for folder in found if is_of(folder, trial.config)]
+        seeds = runs.seeds(same, "agent_steps", RETURN, warn, once=True) if any(folder.rows for folder in same) else []
         if seeds:
             shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
             line = _until(curves.summarize(shifted, "median"), end)
+            redrawn = tuple(_until(one, end) for one in curves.redrawn(shifted, "median", NUM_REDRAWN))
             reference = figure.references.get(series)
-            measured[series] = Measured(line, reference or line, min(end, float(reference.x[-1])) if reference else end)
+            end = min(end, float(reference.x[-1])) if reference else end
+            measured[series] = Measured(line, reference or line, end, redrawn)
     return measured
+
+
+def is_of(folder: RunFolder, config: Config) -> bool:
+    """Whether a folder's runs are those of the config, but for their seeds and length."""
+    if folder.config != runs.fields(config):
+        return False
+    return configs.read(folder.path / "config.yaml").get("eval_every") == config["eval_every"]
+
+
+def origin(folder: RunFolder) -> str:
+    """What code trained it, on what device; of the last session."""
+    try:
+        manifest = json.loads((folder.path / "manifest.json").read_text())
+        return f"revision {(manifest['git_revision'] or 'unknown')[:12]} on {manifest['device']['backend']}"
+    except (OSError, ValueError, KeyError):
+        return "an unknown revision"
 
 
 def of_thesis(figure: Figure) -> dict[str, Measured]:
@@ -180,15 +199,33 @@ def _cut(figure: Figure, words: Sequence[str], num_seeds: int, scale: float) -> 
     return configs.override(config, [("num_updates", num_updates), ("num_seeds", num_seeds)])
 
 
-def _trial(config: Config, directory: Path, found: Sequence[RunFolder]) -> Trial:
-    fields, seeds = runs.fields(config), configs.run_settings(config).seeds
-    for folder in found:
-        others = configs.run_settings(configs.load(folder.path / "config.yaml")).seeds
-        if folder.config == fields and others == seeds:
-            return Trial(config, configs.build(config), folder.path)
+def _trials(config: Config, directory: Path, found: Sequence[RunFolder]) -> list[Trial]:
+    """Folders that hold seeds which no larger one holds, then a new folder for each range of seeds that none does."""
+    experiment, missing = configs.build(config), set(configs.run_settings(config).seeds)
+    held = {
+        folder.path: configs.run_settings(configs.load(folder.path / "config.yaml")).seeds
+        for folder in found
+        if is_of(folder, config)
+    }
     parts = "-".join(config[part]["name"] for part in configs.REGISTERED)
-    digest = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:8]
-    return Trial(config, configs.build(config), directory / f"{parts}-{digest}-seeds-{seeds[0]}-{seeds[-1]}")
+    digest = hashlib.sha256(json.dumps(runs.fields(config), sort_keys=True).encode()).hexdigest()[:8]
+    trials = []
+
+    def add(path: Path, seeds: Sequence[int]) -> None:
+        trials.append(
+            Trial(configs.override(config, [("seed", seeds[0]), ("num_seeds", len(seeds))]), experiment, path)
+        )
+        missing.difference_update(seeds)
+
+    for path, seeds in sorted(held.items(), key=lambda item: -len(item[1])):
+        if missing.intersection(seeds):
+            add(path, seeds)
+    while missing:
+        first = last = min(missing)
+        while last + 1 in missing:
+            last += 1
+        add(directory / f"{parts}-{digest}-seeds-{first}-{last}", range(first, last + 1))
+    return trials
 
 
 def _until(line: Line, end: float) -> Line:

@@ -13,16 +13,19 @@ HEAD = """\
 
 Medians over seeds. The final level is the mean of the last tenth of a curve, with quartiles where there are any. Steps
 are millions of agent steps to a share of the way from the start to the final level of the thesis's curve; a dash means
-never. A verdict takes all seeds that a figure asks for, trained to the end of what the figure shows.
+never. A verdict takes all seeds that a figure asks for, trained as far as the claim looks, and that it would be the
+same for nine of ten redrawings of these seeds (bootstrap); four of five redrawings give numbers within the brackets.
 """
 
 
-def page(sections: Sequence[str]) -> str:
-    """The whole report."""
-    return "\n".join([HEAD, *sections])
+def page(sections: Sequence[str], origins: Sequence[str]) -> str:
+    """The whole report; `origins` say what the runs were trained with."""
+    return "\n".join([HEAD, f"Trained with {'; '.join(origins)}.\n", *sections])
 
 
-def section(figure: Figure, trials: Mapping[str, Trial], measured: Mapping[str, Measured], words: Sequence[str]) -> str:
+def section(
+    figure: Figure, trials: Mapping[str, Sequence[Trial]], measured: Mapping[str, Measured], words: Sequence[str]
+) -> str:
     """One figure: the picture, a table of its series, and verdicts; or that it was not run."""
     title = f"## {figure.name}: {figure.title}\n\n"
     if not measured:
@@ -38,7 +41,7 @@ def _cuts(measured: Mapping[str, Measured]) -> list[str]:
     return [f"Cut: {'; '.join(cut)} of what the figure shows."] if cut else []
 
 
-def _table(figure: Figure, trials: Mapping[str, Trial], measured: Mapping[str, Measured]) -> str:
+def _table(figure: Figure, trials: Mapping[str, Sequence[Trial]], measured: Mapping[str, Measured]) -> str:
     """A row for each series: final levels and steps, ours and the thesis's."""
     heads = ["series", "seeds", "M agent steps", "final", "in the thesis"]
     rows = [[*heads, *(f"{x:.0%} at (thesis)" for x in FRACTIONS)], ["---"] * (len(heads) + len(FRACTIONS))]
@@ -46,7 +49,7 @@ def _table(figure: Figure, trials: Mapping[str, Trial], measured: Mapping[str, M
     for name in trials:
         ours, thesis = measured.get(name), theirs.get(name)
         length = f"{ours.line.x[-1] / 1e6:.1f}" if ours else "not run"
-        steps = [f"{_steps(ours, x)} ({_steps(thesis, x)})" for x in FRACTIONS]
+        steps = [f"{_steps(thesis and ours, x)} ({_steps(thesis, x)})" for x in FRACTIONS]
         rows.append([name, str(ours.num_seeds if ours else 0), length, _level(ours), _level(thesis), *steps])
     return _markdown(rows)
 
@@ -54,8 +57,9 @@ def _table(figure: Figure, trials: Mapping[str, Trial], measured: Mapping[str, M
 def _verdicts(figure: Figure, measured: Mapping[str, Measured]) -> str:
     rows = [["claim", "verdict", "here", "in the thesis", "accepted"], ["---"] * 5]
     for verdict in experiments.verdicts(figure, measured):
-        numbers = (_number(verdict, x) for x in (verdict.here, verdict.thesis))
-        rows.append([verdict.claim.says, verdict.outcome, *numbers, _range(verdict)])
+        here, thesis, low, high = (_number(verdict, x) for x in (verdict.here, verdict.thesis, *verdict.interval))
+        here += "" if low == "-" else f" [{low}, {high}]"
+        rows.append([verdict.claim.says, verdict.outcome, here, thesis, _range(verdict)])
     return _markdown(rows)
 
 
@@ -69,6 +73,8 @@ def _range(verdict: Verdict) -> str:
 def _number(verdict: Verdict, value: float) -> str:
     if math.isnan(value):
         return "-"
+    if math.isinf(value):
+        return "never"
     return f"{value / 1e6:.3g} M steps" if verdict.claim.kind == "steps" else f"{value:.3g}"
 
 

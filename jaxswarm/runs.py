@@ -102,11 +102,14 @@ def common_name(configs_of_groups: Sequence[Fields]) -> str:
     return ", ".join(name for choices in names if len(choices) == 1 for name in choices if name)
 
 
-def seeds(folders: Sequence[RunFolder], x: str, y: str, warn: Callable[[str], object]) -> list[Curve]:
+def seeds(
+    folders: Sequence[RunFolder], x: str, y: str, warn: Callable[[str], object], *, once: bool = False
+) -> list[Curve]:
     """A curve for each seed of a group.
 
-    A seed that two folders hold with the same numbers, as a copy or a longer run does, counts once. What is left out,
-    and seeds that occur more than once, are told to `warn`, one line each.
+    A seed that two folders hold with the same numbers, as a copy or a longer run does, counts once; with `once` also
+    one that they hold with other numbers, as two devices may give. The longer one is counted. What is left out, and
+    seeds that occur more than once, are told to `warn`, one line each.
     """
     kept: dict[int, list[_Seed]] = defaultdict(list)
     for folder in folders:
@@ -120,7 +123,7 @@ def seeds(folders: Sequence[RunFolder], x: str, y: str, warn: Callable[[str], ob
         by_update, _ = curves.from_rows(folder.rows, "update", y)
         for number, curve in mine.items():
             seed = _Seed(folder.path, by_update[number], curve)
-            same = next((i for i, other in enumerate(kept[number]) if seed.is_same(other)), None)
+            same = next((i for i, other in enumerate(kept[number]) if once or seed.is_same(other)), None)
             if same is None:
                 kept[number].append(seed)
                 continue

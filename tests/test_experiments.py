@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import math
 
 import jax
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 
 from jaxswarm import config as configs
-from jaxswarm import experiments, sweep
+from jaxswarm import curves, experiments, sweep
 from jaxswarm.claims import KINDS, Claim, Measured, judge
 from jaxswarm.cli import experiment as program
 from jaxswarm.config import ConfigError
-from jaxswarm.curves import Line
+from jaxswarm.curves import Curve, Line
 
 MEDIUM, SIMPLE = ((120, 60), (160,), "leaky_relu"), ((64,), (64,), "leaky_relu")
 MEAN_OPT, ATTENTIVE = ((174, 226, 96), (97,), "relu"), ((72,), (132, 200), "leaky_relu")
@@ -269,9 +270,119 @@ def test_a_level_that_is_never_reached_is_no_evidence():
     assert judge(claim, {"a": low}, SERIES, enough=16).outcome == "not reproduced"
 
 
+def test_never_is_longer_than_any_time():
+    never = dataclasses.replace(SERIES["c"], line=ramp(2.0, 40.0))
+    claim = Claim("", "pace", ("a", "b"), fraction=0.9)
+    assert claim.number({"a": SERIES["a"], "b": never}) == 0
+    assert claim.number({"a": never, "b": SERIES["a"]}) == math.inf
+    assert math.isnan(claim.number({"a": never, "b": never}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "outcome"),
+    [
+        ("level", {"at": 50.0}, "reproduced"),
+        ("level", {"at": 70.0}, "run was cut"),
+        ("steps", {"fraction": 0.9}, "reproduced"),
+        ("final", {}, "run was cut"),
+    ],
+)
+def test_claims_about_the_beginning_need_no_more_than_that(kind, fields, outcome):
+    series = {"a": measured(ramp(10.0, 40.0, end=60.0))}
+    series["a"] = dataclasses.replace(series["a"], reference=ramp(10.0, 40.0))
+    assert judge(Claim("", kind, ("a",), high=100.0, **fields), series, SERIES, enough=16).outcome == outcome
+
+
+@pytest.mark.parametrize(
+    ("spread", "room", "outcome"),
+    [(0.0, 0.5, "reproduced"), (5.0, 0.5, "not enough runs"), (0.1, -1.0, "not reproduced")],
+)
+def test_verdicts_take_that_redrawn_seeds_agree(spread, room, outcome):
+    rng, x = np.random.default_rng(0), np.arange(1.0, 101)
+    seeds = [Curve(x, np.full(100, 10 + spread * noise)) for noise in rng.normal(size=16)]
+    line = curves.summarize(seeds, "median")
+    one = Measured(line, line, 100.0, tuple(curves.redrawn(seeds, "median", 200)))
+    verdict = judge(Claim("", "final", ("a",), high=line.y[0] + room), {"a": one}, SERIES, enough=16)
+    assert verdict.outcome == outcome
+    low, high = verdict.interval
+    assert low <= verdict.here <= high
+    expected = np.percentile([np.median(rng.choice([s.y[0] for s in seeds], 16)) for _ in range(2000)], [10, 90])
+    np.testing.assert_allclose([low, high], expected, atol=0.2 * spread + 1e-9)
+
+
+@pytest.fixture
+def trained(tmp_path):
+    """Makes a run folder of figure 6.15's first series that looks as if these seeds had been trained."""
+
+    def write(name, seed, num_seeds, level=1.0, **changes):
+        words = experiments.load("fig_6_15").series["μ only"]
+        changes |= {"seed": seed, "num_seeds": num_seeds}
+        config = configs.compose([*words, *(f"{key}={value}" for key, value in changes.items())])
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").write_text(configs.dump(config))
+        manifest = {"git_revision": "0123456789abcdef", "device": {"backend": "cpu"}}
+        (tmp_path / name / "manifest.json").write_text(json.dumps(manifest))
+        rows = [
+            f"{u},{102_000 * u},0,{s},{level + s}" for u in range(0, 400, 100) for s in range(seed, seed + num_seeds)
+        ]
+        text = "\n".join(["update,agent_steps,wall_seconds,seed,eval/return", *rows, ""])
+        (tmp_path / name / "metrics.csv").write_text(text)
+        return tmp_path / name
+
+    return write
+
+
+def seeds_of(trials):
+    return [trial.settings.seeds for trial in trials]
+
+
+def test_only_seeds_that_are_missing_are_trained(trained, tmp_path):
+    figure = experiments.load("fig_6_15")
+
+    def plan(num_seeds):
+        return experiments.plan(figure, tmp_path, experiments.stored(tmp_path), num_seeds)["μ only"]
+
+    assert seeds_of(plan(4)) == [(0, 1, 2, 3)]
+    first, second = trained("first", 0, 2), trained("second", 5, 1)
+    trained("coarse", 2, 1, eval_every=100)
+    assert seeds_of(plan(4)) == [(0, 1), (2, 3)]
+    assert seeds_of(plan(8)) == [(0, 1), (5,), (2, 3, 4), (6, 7)]
+    assert [trial.run_dir for trial in plan(8)][:2] == [first, second]
+    larger = trained("larger", 0, 8)
+    assert [trial.run_dir for trial in plan(8)] == [larger]
+    assert [trial.run_dir for trial in plan(2)] == [larger]
+
+
+def test_a_seed_that_two_folders_hold_counts_once(trained, tmp_path):
+    figure = experiments.load("fig_6_15")
+    for name, level in (("one", 1.0), ("other", 1.0001)):
+        trained(name, 0, 4, level)
+    found = experiments.stored(tmp_path)
+    ours = experiments.measure(figure, experiments.plan(figure, tmp_path, found), found, lambda text: None)
+    assert ours["μ only"].num_seeds == 4
+
+
+def test_a_report_is_not_replaced_by_an_empty_one(tmp_path, capsys):
+    (tmp_path / "report.md").write_text("precious")
+    assert program.main(["all", f"dir={tmp_path / 'typo'}", f"out={tmp_path}"]) == 2
+    assert "typo holds no run folder" in capsys.readouterr().err
+    assert (tmp_path / "report.md").read_text() == "precious"
+
+
+def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
+    trained("mine", 0, 2)
+    odd = trained("odd", 0, 2, num_worlds=40, num_steps=51)
+    (odd / "config.yaml").write_text((odd / "config.yaml").read_text() + "gone: 1\n")  # a key of another version
+    assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
+    assert f"warning: {odd} is of no figure" in capsys.readouterr().err
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "| μ only | 2 |" in report
+    assert "Trained with revision 0123456789ab on cpu." in report
+
+
 def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):
-    first = experiments.plan(experiments.load("fig_6_5"), tmp_path, scale=0.1)["Bayesian agg."]
-    second = experiments.plan(experiments.load("fig_6_15"), tmp_path)["μ only"]
+    (first,) = experiments.plan(experiments.load("fig_6_5"), tmp_path, scale=0.1)["Bayesian agg."]
+    (second,) = experiments.plan(experiments.load("fig_6_15"), tmp_path)["μ only"]
     assert first.run_dir == second.run_dir
     assert (first.num_updates, second.num_updates) == (40, 343)
     assert (first.settings.num_seeds, second.settings.num_seeds) == (16, 16)
@@ -285,6 +396,7 @@ def test_wrong_words_are_errors(capsys):
         (["fig_6_15", "scale=2"], "numbers above 0"),
         (["fig_6_15", "seeds=0"], "integers from 1"),
         (["fig_6_15", "series=mu*"], "'μ only', 'μ+σ²'"),
+        (["fig_6_15", "num_seeds=2"], "write seeds=N"),
         (["all", "seeds=3"], "no meaning here"),
     ]:
         assert program.main(words) == 2

@@ -1,6 +1,7 @@
 """The program `jaxswarm-experiment`."""
 
 import fnmatch
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -50,6 +51,8 @@ def main(arguments: Sequence[str]) -> int:
         if name == "all":
             return _report_all(directory, out, words)
         return _run(arguments, directory, out, options, words)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise ConfigError(f"cannot write to {error.filename}: {error.strerror}") from error
 
@@ -58,6 +61,8 @@ def _run(arguments: Sequence[str], directory: Path, out: Path, options: dict[str
     from jaxswarm import experiments  # noqa: PLC0415
 
     figure = experiments.load(arguments[0])
+    if any(word.startswith("num_seeds=") for word in words):
+        raise ConfigError("num_seeds has no meaning here; write seeds=N")
     num_seeds = whole("seeds", options["seeds"], 1) if "seeds" in options else None
     scale, chosen = _scale(options.get("scale", "1")), _choose(list(figure.series), options.get("series", "*"))
     trials = experiments.plan(figure, directory, experiments.stored(directory), num_seeds, scale, words)
@@ -73,10 +78,21 @@ def _run(arguments: Sequence[str], directory: Path, out: Path, options: dict[str
 def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
     from jaxswarm import experiments, report  # noqa: PLC0415
 
-    found, sections = experiments.stored(directory), []
+    found, sections, used = experiments.stored(directory), [], set()
+    if not found:
+        raise ConfigError(
+            f"dir = {directory} holds no run folder; train a figure first, or name the folder of its runs"
+        )
     for figure in map(experiments.load, experiments.names()):
-        sections.append(_section(figure, experiments.plan(figure, directory, found, words=words), found, out, words))
-    replace_text(out / "report.md", report.page(sections))
+        trials = experiments.plan(figure, directory, found, words=words)
+        sections.append(_section(figure, trials, found, out, words))
+        configs_of_series = [trial.config for trial, *_ in trials.values()]
+        used |= {folder.path for folder in found if any(experiments.is_of(folder, x) for x in configs_of_series)}
+    for folder in found:
+        if folder.path not in used:
+            print(f"warning: {folder.path} is of no figure", file=sys.stderr)
+    origins = sorted({experiments.origin(folder) for folder in found if folder.path in used})
+    replace_text(out / "report.md", report.page(sections, origins))
     print(f"wrote {out / 'report.md'}")
     return 0
 
@@ -97,15 +113,15 @@ def _train(trials: dict) -> bool:
     from jaxswarm import experiments, sweep  # noqa: PLC0415
 
     use_compile_cache()
-    use_cores(next(iter(trials.values())).settings.num_seeds)
-    for number, (series, trial) in enumerate(trials.items()):
-        steps = trial.num_updates * trial.experiment.agent_steps_per_update
-        print(
-            f"series {number + 1} of {len(trials)}: {series}, seeds: {trial.settings.num_seeds}, {steps:,} agent steps"
-        )
-        print(f"  {trial.run_dir}", flush=True)
-        if not experiments.is_finished(trial) and not sweep.train([trial])[0]:
-            return False
+    use_cores(math.gcd(*[trial.settings.num_seeds for of_series in trials.values() for trial in of_series]))
+    for number, (series, of_series) in enumerate(trials.items()):
+        for trial in of_series:
+            seeds, steps = trial.settings.seeds, trial.num_updates * trial.experiment.agent_steps_per_update
+            length = f"seeds {seeds[0]} to {seeds[-1]}, {steps:,} agent steps"
+            print(f"series {number + 1} of {len(trials)}: {series}, {length}")
+            print(f"  {trial.run_dir}", flush=True)
+            if not experiments.is_finished(trial) and not sweep.train([trial])[0]:
+                return False
     return True
 
 
