@@ -144,7 +144,7 @@ def set_aside_after(directory: Path, update: int) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Writes a file as a whole: after a crash it has its old content or the new."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with open(temporary, "w", encoding="utf-8") as file:
         file.write(text)
         file.flush()

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Config = dict[str, Any]
 
 REGISTERED = ("task", "aggregator", "learner")  # groups whose files have a `name`
+NO_PRESET = ("experiment", None)
 PARTS = (*REGISTERED, "network")  # what an experiment is made of, one dict each
 SEARCHES = "search"  # the folder of search spaces, which are no part of a config
 FIGURES = "figure"  # that of figures, each of several configs
@@ -98,7 +99,9 @@ def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     groups = choices()
-    chosen = {key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and value is not None}
+    chosen = {
+        key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and (key, value) != NO_PRESET
+    }
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             composed = compose("train", [f"{group}={choice}" for group, choice in chosen.items()])

@@ -23,7 +23,7 @@ import numpy as np
 from jaxswarm import ensemble, loggers, reporting
 from jaxswarm.checkpoint import Restored, restore, set_aside_after
 from jaxswarm.ensemble import Batch
-from jaxswarm.recording import Recorder, Run, draw_curve
+from jaxswarm.recording import Recorder, Run, draw_curve, locked
 from jaxswarm.reporting import Row
 from jaxswarm.training import Experiment, TrainState, init
 from jaxswarm.types import Metrics
@@ -108,6 +108,22 @@ def fit_runs(
             raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
         for name in run.loggers:
             loggers.load(name)
+    with contextlib.ExitStack() as locks:
+        for run in runs:
+            if run.run_dir and jax.process_index() == 0:
+                locks.enter_context(locked(run.run_dir))
+        return _fit(runs, num_updates, resume, progress, checkpoint_seconds, keep_checkpoints)
+
+
+def _fit(
+    runs: Sequence[Run],
+    num_updates: int,
+    resume: bool,
+    progress: bool,
+    checkpoint_seconds: float,
+    keep_checkpoints: int,
+) -> tuple[TrainState, list[list[Row]]]:
+    """`fit_runs` in folders that nobody else writes into."""
     is_first = jax.process_index() == 0  # of several processes, only the first one writes and talks
     restored = _restore(runs) if resume else None
     if restored and restored[0].update >= num_updates:

@@ -8,6 +8,7 @@ returns when all is written. A `ConfigError` says which extra has to be installe
 import importlib
 import math
 import os
+import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -54,14 +55,21 @@ class TensorBoard:
 class WeightsAndBiases:
     """A run of the project `jaxswarm`, in the group of its run folder; offline where `WANDB_MODE=offline` says so.
 
-    Its files are in `run_dir/wandb`. Project, account and the like follow the variables `WANDB_...` of the environment.
+    Its files are in `run_dir/wandb`; a resumed run goes on with the same one. Project, account and the like follow the
+    variables `WANDB_...` of the environment.
     """
 
     def __init__(self, run_dir: str | Path, config: Mapping[str, Any] | None, seed: int):
         package, run_dir = load("wandb"), Path(run_dir).resolve()
         run_dir.mkdir(parents=True, exist_ok=True)
+        id_file = run_dir / "wandb" / f"seed_{seed}.id"
+        id_file.parent.mkdir(exist_ok=True)
+        if not id_file.exists():
+            id_file.write_text(uuid.uuid4().hex[:8])
         try:
             self._run = package.init(
+                id=id_file.read_text(),
+                resume="allow",
                 project=os.environ.get("WANDB_PROJECT", "jaxswarm"),
                 dir=run_dir,
                 group=run_dir.name,

@@ -149,6 +149,8 @@ class ActorCritic(nn.Module):
         require(self, ", ".join(ACTIVATIONS), lambda x: x in ACTIVATIONS, "activation")
         require(self, "separate, shared", lambda x: x in ("separate", "shared"), "latent_space")
         require(self, "shared, state", lambda x: x in ("shared", "state"), "std")
+        if hasattr(self.aggregator, "check_width"):
+            self.aggregator.check_width((*self.encoder, *self.shared_encoder)[-1])
         super().__post_init__()
 
     def setup(self) -> None:  # noqa: D102

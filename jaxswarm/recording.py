@@ -1,8 +1,10 @@
 """What becomes of one run while it is trained: rows, the files in its folder, checkpoints."""
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import numpy as np
 
 from jaxswarm import reporting
 from jaxswarm.checkpoint import Checkpoints, Restored
+from jaxswarm.config import ConfigError
 from jaxswarm.loggers import LOGGERS, Logger
 from jaxswarm.reporting import RETURN, Row
 from jaxswarm.training import Experiment, TrainState, is_loss
@@ -35,6 +38,27 @@ class _Candidate:
     states: TrainState  # leaves [seeds, ...]
     record: dict[str, Any]
     score: float | None
+
+
+@contextlib.contextmanager
+def locked(run_dir: Path) -> Iterator[None]:
+    """Keeps other processes from training into a folder; a `ConfigError` if one does. Ends with the process at latest.
+
+    Does nothing where the system has no such locks.
+    """
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            import fcntl  # noqa: PLC0415
+
+            descriptor = os.open(run_dir, os.O_RDONLY)
+            stack.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{run_dir} is being trained by another process; wait for it, or stop it") from None
+        except (ImportError, OSError):
+            pass
+        yield
 
 
 class Recorder:

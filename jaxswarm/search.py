@@ -35,8 +35,12 @@ def load_space(name: str, config: Config) -> Space:
     content = configs.read(path)
     if unknown := set(content) - {"parameters", "aggregator"}:
         raise ConfigError(f"{path} has a key {unknown.pop()!r}; accepted: parameters, aggregator")
-    of_aggregator = content.get("aggregator", {}).get(config["aggregator"]["name"], {})
-    space = content.get("parameters", {}) | of_aggregator
+    parameters, of_aggregators = (content.get(part) or {} for part in ("parameters", "aggregator"))
+    if not all(isinstance(x, dict) for x in (parameters, of_aggregators, *getattr(of_aggregators, "values", list)())):
+        raise ConfigError(
+            f"{path} is no search space; accepted: parameters: {{key: choice}}, aggregator: {{name: {{...}}}}"
+        )
+    space = parameters | of_aggregators.get(config["aggregator"]["name"], {})
     for key, choice in space.items():
         _check(key, choice)
     return space
@@ -97,10 +101,16 @@ def suggest(trial: "optuna.Trial", space: Space, pairs: Sequence[tuple[str, Any]
     return configs.override(config, [(BATCH_SIZE, sizes[0])])
 
 
-def value(rows: Sequence[Row]) -> float:
-    """Mean over all evaluations and seeds; NaN without any."""
-    returns = [row[RETURN] for row in rows]
-    return float(np.mean(returns)) if returns else math.nan
+def value(rows: Sequence[Row], seeds: Sequence[int]) -> float:
+    """Mean over all evaluations and seeds; NaN without any. A seed that diverged has its worst from there on."""
+    if not rows:
+        return math.nan
+    num_evaluations, worst = len({row["update"] for row in rows}), min(row[RETURN] for row in rows)
+    returns = []
+    for seed in seeds:
+        mine = [row[RETURN] for row in rows if row["seed"] == seed]
+        returns += mine + [min(mine, default=worst)] * (num_evaluations - len(mine))
+    return float(np.mean(returns))
 
 
 def tell(study: "optuna.Study", trial: "optuna.Trial", found: float) -> None:
@@ -133,10 +143,25 @@ def _suggest(trial: "optuna.Trial", key: str, choice: Any) -> Any:
 
 def _check(key: str, choice: Any) -> None:
     """Raises a `ConfigError` for what is not a choice."""
-    names = {"low", "high", "log", "step", "layers", "last"}
-    if isinstance(choice, list) and choice:
-        return
-    is_range = isinstance(choice, Mapping) and {"low", "high"} <= choice.keys() <= names
-    if not isinstance(choice, Mapping) or not is_range or choice["low"] > choice["high"]:
-        accepted = "a list, or low, high and if wanted log, step, layers, last"
+    if not ((isinstance(choice, list) and choice) or _is_range(choice, {"log", "step", "layers", "last"})):
+        accepted = "a list, or numbers low and high and if wanted log (from above 0), step, layers: [least, most], last"
         raise ConfigError(f"{key}: {choice} is not possible in a search space; accepted: {accepted}")
+
+
+def _is_range(choice: Any, more: set[str]) -> bool:
+    """Whether it has numbers low <= high, and of `more` nothing that cannot be."""
+
+    def is_number(x: Any) -> bool:
+        return isinstance(x, int | float) and not isinstance(x, bool)
+
+    if not isinstance(choice, Mapping) or not {"low", "high"} <= choice.keys() <= {"low", "high", *more}:
+        return False
+    low, high, step, layers = (choice.get(name) for name in ("low", "high", "step", "layers"))
+    if not is_number(low) or not is_number(high) or low > high or (choice.get("log") and low <= 0):
+        return False
+    is_pair = isinstance(layers, list) and len(layers) == 2 and all(isinstance(x, int) and x >= 0 for x in layers)
+    return (
+        (step is None or (is_number(step) and step > 0 and not choice.get("log")))
+        and (layers is None or (is_pair and layers[0] <= layers[1]))
+        and ("last" not in choice or (layers is not None and _is_range(choice["last"], {"log", "step"})))
+    )

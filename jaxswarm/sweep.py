@@ -62,7 +62,8 @@ def trials(wanted: Sequence[Config], sweep_dir: Path) -> list[Trial]:
         for index, label in enumerate(labels)
     ]
     if len(set(labels)) < len(labels):
-        raise ConfigError("two runs of the sweep are the same; accepted: different values, and num_seeds for seeds")
+        names = ", ".join(sorted(folders.NOT_COMPARED))
+        raise ConfigError(f"two runs of the sweep are the same but for {names}; accepted: other values of other keys")
     return [
         Trial(config, experiment, sweep_dir / name)
         for config, experiment, name in zip(wanted, experiments, names, strict=True)
@@ -107,7 +108,9 @@ def train(together: Sequence[Trial], progress: bool = True) -> tuple[bool, list[
 
 
 def summary(sweep: Sequence[Trial], rows: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
-    """Of each trial the return at its end: median and quartiles over the seeds that reached it; best ones first."""
+    """Of each trial the return at its end: median and quartiles over the seeds that reached it; those without a seed
+    that diverged first, of these the best.
+    """
     table = []
     for trial, of_trial in zip(sweep, rows, strict=True):
         final = [row[RETURN] for row in of_trial if row["update"] == trial.num_updates]
@@ -115,7 +118,7 @@ def summary(sweep: Sequence[Trial], rows: Sequence[Sequence[Row]]) -> list[dict[
         numbers = {"median": float(median), "q25": float(low), "q75": float(high)}
         counts = {"seeds": len(final), "diverged": trial.settings.num_seeds - len(final)}
         table.append({"run": trial.run_dir.name} | numbers | counts)
-    return sorted(table, key=lambda line: -np.nan_to_num(line["median"], nan=-np.inf))
+    return sorted(table, key=lambda line: (line["diverged"], -np.nan_to_num(line["median"], nan=-np.inf)))
 
 
 def write_summary(path: Path, table: Sequence[dict[str, Any]]) -> None:

@@ -122,6 +122,7 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("task.visibility_radius=-1", ["visibility_radius = -1.0"]),
         ("learner.batch_size=77", ["batch_size = 77", "divisors"]),
         ("learner.batch_size=1000000", ["batch_size = 1000000"]),
+        ("aggregator=null", ["aggregator = None", "bayesian"]),
         ("seed=-1", ["seed = -1"]),
         ("num_updates=0", ["num_updates = 0"]),
         ("keep_checkpoints=0", ["keep_checkpoints = 0"]),
@@ -158,3 +159,11 @@ def test_run_settings_are_the_keys_beside_the_experiment():
         "render_every": None,
         "loggers": (),
     }
+
+
+def test_heads_have_to_share_the_width():
+    words = ["aggregator=attentive", "aggregator.num_heads=2"]
+    assert configs.build(configs.compose([*words, "network.encoder=[65,8]"]))
+    for encoder in ("[65]", "[8] network.shared_encoder=[65]"):
+        with pytest.raises(ConfigError, match="num_heads = 2 is not possible; accepted: divisors of 65 features"):
+            configs.build(configs.compose([*words, *f"network.encoder={encoder}".split()]))

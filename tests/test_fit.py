@@ -11,8 +11,9 @@ import pytest
 import jaxswarm
 from jaxswarm import checkpoint, config, reporting
 from jaxswarm import fit as fitting
+from jaxswarm.config import ConfigError
 from jaxswarm.fit import DivergedError, fit
-from jaxswarm.recording import Recorder
+from jaxswarm.recording import Recorder, locked
 
 WORDS = (
     "task.num_agents=3 task.episode_length=5 num_worlds=2 num_steps=4 learner.batch_size=12 eval_worlds=2 eval_every=3 "
@@ -84,6 +85,16 @@ def test_the_run_folder_is_complete(undisturbed):
     best = max(undisturbed[1], key=lambda row: row["eval/return"])
     restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT), "best")
     assert (restored.update, np.float32(restored.score)) == (best["update"], np.float32(best["eval/return"]))
+
+
+def test_two_processes_do_not_train_into_one_folder(tmp_path):
+    """Locks belong to open files, so that one process can play both."""
+    with locked(tmp_path / "run"):
+        with pytest.raises(ConfigError, match="run is being trained by another process"):
+            fit(EXPERIMENT, NUM_UPDATES, run_dir=tmp_path / "run", **OPTIONS)
+        assert not list((tmp_path / "run").iterdir())
+    with locked(tmp_path / "run"):
+        pass  # the first one has ended
 
 
 def test_chunks_of_any_length_give_the_same(undisturbed, tmp_path, monkeypatch):

@@ -69,15 +69,19 @@ def test_weights_and_biases_works_offline(tmp_path, monkeypatch):
         loggers[0].log(row)
     for logger in loggers:
         logger.close()
+    LOGGERS["wandb"](run_dir, None, 4).close()  # as a resumed run does
     wandb.teardown()
-    found = {}
+    found, ids = {}, {}
     for path in (run_dir / "wandb").glob("offline-run-*/*.wandb"):
         kept = [messages.Record.FromString(chunk) for chunk in chunks(path)]
         (run,) = (record.run for record in kept if record.WhichOneof("record_type") == "run")
         history = [record.history for record in kept if record.WhichOneof("record_type") == "history"]
         items = [{item.nested_key[0] or item.key: json.loads(item.value_json) for item in x.item} for x in history]
+        assert run.run_id not in ids or ids[run.run_id] == run.display_name
+        ids[run.run_id] = run.display_name
         found[run.display_name] = (run, items)
     assert found.keys() == {"run-seed3", "run-seed4"}
+    assert len(ids) == 2
     run, items = found["run-seed3"]
     assert (run.project, run.run_group) == ("jaxswarm", "run")
     values = [(x["agent_steps"], name, x[name]) for x in items for name in ("eval/return", "learner/loss") if name in x]

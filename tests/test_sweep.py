@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxswarm import config, fit, reporting, search, sweep
 from jaxswarm.cli import evaluate
 from jaxswarm.cli import sweep as program
 from jaxswarm.config import ConfigError
+from jaxswarm.learners.on_policy import batch_size
 
 WORDS = [*TINY, "num_updates=4", "num_seeds=2"]
 SWEPT = [*WORDS, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu"]
@@ -87,6 +89,38 @@ def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, 
     assert "of each of 2 seeds" in capsys.readouterr().out
 
 
+def test_a_seed_that_diverges_counts_with_its_worst():
+    rows = [{"update": u, "seed": 0, "eval/return": float(u)} for u in (0, 10, 20)]
+    assert search.value(rows, [0]) == 10
+    rows += [{"update": 0, "seed": 1, "eval/return": -6.0}]
+    assert search.value(rows, [0, 1]) == 2
+    assert search.value(rows, [0, 1, 2]) == (10 - 6 - 6) / 3
+    assert math.isnan(search.value([], [0]))
+
+
+def test_runs_with_seeds_that_diverged_come_last():
+    wanted = config.compose(WORDS)
+
+    def trial(number):
+        return sweep.Trial(wanted, config.build(wanted), Path(f"run{number}"))
+
+    rows = [
+        [{"update": 4, "seed": s, "eval/return": x} for s, x in enumerate(xs)] for xs in ([9.0], [1.0, 2.0], [3.0, 4.0])
+    ]
+    table = sweep.summary([trial(i) for i in range(3)], rows)
+    assert [line["run"] for line in table] == ["run2", "run1", "run0"]
+
+
+@pytest.mark.parametrize("where", ["a_file", "/proc/nowhere"])
+def test_folders_that_cannot_be_written_are_named(where, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a_file").write_text("")
+    assert program.main(["learner.discount=0.9,0.8", f"sweep_dir={where}"]) == 2
+    assert where in capsys.readouterr().err
+    assert program.main(["num_updates=1,2", "sweep_dir=new"]) == 2
+    assert "same but for" in capsys.readouterr().err
+
+
 SPACE = """
 parameters:
   learner.learning_rate: {low: 1e-4, high: 1e-2, log: true}
@@ -104,7 +138,8 @@ def test_the_space_of_the_thesis_gives_configs_for_each_aggregator():
             study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed))
             experiment = config.build(search.suggest(study.ask(), space, pairs))
             assert 1 <= len(experiment.network.encoder) <= 3
-            assert 400 < experiment.batch_size < 12_000
+            sizes = experiment.learner, experiment.agent_steps_per_update, experiment.task.num_agents
+            assert 400 < batch_size(*sizes) < 12_000
 
 
 @pytest.mark.parametrize(
@@ -112,6 +147,12 @@ def test_the_space_of_the_thesis_gives_configs_for_each_aggregator():
     [
         ("parameters: {learner.learning_rate: {low: 2, high: 1}}", "not possible in a search space"),
         ("parameters: {learner.learning_rate: {lowest: 1}}", "not possible in a search space"),
+        ("parameters: {learner.learning_rate: {low: a, high: 2}}", "not possible in a search space"),
+        ("parameters: {learner.learning_rate: {low: 0, high: 1, log: true}}", "not possible in a search space"),
+        ("parameters: {network.encoder: {layers: 2, low: 1, high: 3}}", "not possible in a search space"),
+        ("parameters: {network.encoder: {layers: [1, 2], low: 1, high: 3, last: 5}}", "not possible in a search space"),
+        ("parameters: [1]", "is no search space"),
+        ("aggregator: {mean: [1]}", "is no search space"),
         ("params: {}", "has a key 'params'"),
     ],
 )

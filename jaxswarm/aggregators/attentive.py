@@ -38,6 +38,11 @@ class Attentive(nn.Module):
         require(self, "mean, query", lambda x: x in ("mean", "query"), "pooling")
         super().__post_init__()
 
+    def check_width(self, width: int) -> None:
+        """Raises a `ValueError` for messages that heads cannot share."""
+        if width % self.num_heads:
+            raise ValueError(f"num_heads = {self.num_heads} is not possible; accepted: divisors of {width} features")
+
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
 
     def pool(self, view: DenseView) -> Float[Array, "receivers features"]:
@@ -55,8 +60,7 @@ class Attentive(nn.Module):
         As y is linear in the values, only one weighted mean of the x_j is taken to values, by receiver and head.
         """
         x, size = view.messages, view.messages.shape[-1]
-        if size % self.num_heads:
-            raise ValueError(f"num_heads = {self.num_heads} is not possible; accepted: divisors of {size} features")
+        self.check_width(size)
         W_in = self.param("in_kernel", nn.initializers.xavier_uniform(), (size, 3 * size))
         b_in = self.param("in_bias", nn.initializers.zeros, (3 * size,))
         W_o = self.param("out_kernel", nn.initializers.orthogonal(math.sqrt(2.0)), (size, size))

@@ -56,6 +56,9 @@ def load_policies(run_dir: Path, config: Config, which: Any, seeds: Sequence[int
         return None
     if restored is None:
         raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: {resume_command(run_dir)}")
+    for seed, reason in restored.record.get("diverged", {}).items():
+        if int(seed) in seeds:
+            warn(f"warning: seed {seed} diverged, its policy is the one before: {reason}")
     wanted = np.array([trained.index(seed) for seed in seeds])
     params = jax.tree.map(lambda x: x[wanted], restored.train_state.learner.params)
     return Policies(experiment.network, params, restored.update, restored.score)

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
         options, words = _load(sweep_dir)
     else:
         sweep_dir = Path(options.pop("sweep_dir", "") or f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}")
-        if sweep_dir.exists() and any(sweep_dir.iterdir()):
+        if sweep_dir.exists() and (not sweep_dir.is_dir() or any(sweep_dir.iterdir())):
             raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; continue it with resume={sweep_dir}")
     if "search" in options:
         return _search(sweep_dir, options, words)
@@ -62,9 +62,9 @@ def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
 
     trials = sweep.trials(sweep.expand(words), sweep_dir)
     programs = sweep.programs(trials)
+    _save(sweep_dir, {}, words)
     use_compile_cache()
     use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
-    _save(sweep_dir, {}, words)
     print(f"{_count(trials, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
     for number, together in enumerate(programs):
@@ -92,9 +92,9 @@ def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> i
     config = configs.compose_pairs(pairs)
     space = search.load_space(options["search"], config)
     num_trials = whole("trials", options.get("trials", 20), 1)
+    _save(sweep_dir, options, words)
     use_compile_cache()
     use_cores(config["num_seeds"])
-    _save(sweep_dir, options, words)
     study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")), config["seed"])
     search.requeue_killed(study, sweep_dir)
     while search.num_begun(study) < num_trials:
@@ -108,7 +108,7 @@ def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> i
             search.requeue(study, asked.number)
             print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return 0
-        search.tell(study, asked, search.value(rows))
+        search.tell(study, asked, search.value(rows, configs.run_settings(of_trial).seeds))
     done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
     for trial in sorted(done, key=lambda trial: trial.value or 0.0, reverse=True)[:5]:
         print(f"{trial.value:10.2f}  {trial.user_attrs[search.RUN_DIR]}  {json.dumps(trial.params)}")
@@ -122,8 +122,11 @@ def _count(things: Sequence, name: str) -> str:
 def _save(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> None:
     from jaxswarm.checkpoint import replace_text  # noqa: PLC0415
 
-    sweep_dir.mkdir(parents=True, exist_ok=True)
-    replace_text(sweep_dir / PLAN, json.dumps({"options": options, "words": list(words)}, indent=2) + "\n")
+    try:
+        sweep_dir.mkdir(parents=True, exist_ok=True)
+        replace_text(sweep_dir / PLAN, json.dumps({"options": options, "words": list(words)}, indent=2) + "\n")
+    except OSError as error:
+        raise ConfigError(f"cannot write to {sweep_dir}: {error.strerror}") from error
 
 
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
