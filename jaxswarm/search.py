@@ -156,7 +156,7 @@ def _is_range(choice: Any, more: set[str]) -> bool:
 
     if not isinstance(choice, Mapping) or not {"low", "high"} <= choice.keys() <= {"low", "high", *more}:
         return False
-    low, high, step, layers = (choice.get(name) for name in ("low", "high", "step", "layers"))
+    low, high, step, layers = choice["low"], choice["high"], choice.get("step"), choice.get("layers")
     if not is_number(low) or not is_number(high) or low > high or (choice.get("log") and low <= 0):
         return False
     is_pair = isinstance(layers, list) and len(layers) == 2 and all(isinstance(x, int) and x >= 0 for x in layers)

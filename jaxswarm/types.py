@@ -1,7 +1,6 @@
 """The few data types that every floor shares."""
 
 import dataclasses
-import numbers
 from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
@@ -68,7 +67,7 @@ def _holds(is_accepted: Callable[[Any], bool], value: Any) -> bool:
 
 def is_whole(least: int) -> Callable[[Any], bool]:
     """Accepts integers from `least`."""
-    return lambda value: isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= least
+    return lambda value: isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
 @pytree

@@ -103,7 +103,7 @@ RUNS = {
         "Max Agg.": (20, "max", "ppo", MEDIUM, 70_965),
     }),
 }  # fmt: skip
-BEST = [f"best_{task}" for task in ("rendezvous", "pursuit", "assembly", "clustering_2")]  # our own
+BEST = [f"best_{task}" for task in ("rendezvous", "pursuit", "pursuit_multi", "assembly", "clustering_2")]  # our own
 LEARNING = {"learning_rate": 3e-4, "adam_epsilon": 1e-5, "num_epochs": 10, "bootstrap_truncation": False}
 TINY = [
     *("task.num_agents=3", "task.num_evaders=1", "task.episode_length=5", "num_worlds=2", "num_steps=4"),

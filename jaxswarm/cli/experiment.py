@@ -20,7 +20,7 @@ Trains all series of a figure of the thesis as they were trained there, and writ
 thesis behind, a table, and a verdict on each thing that the figure shows. The same command continues after Ctrl-C.
 Figures share run folders where their series are the same. all trains nothing: it reports what has been trained.
 
-  seeds=N          of each series; default: as many as verdicts need
+  seeds=N          of each series; default: as many as verdicts need. More seeds later train only those that are missing
   scale=0.1        a tenth of the updates; verdicts then say that the runs were cut. A larger scale goes on from there
   series=PATTERN   only series with such names, * for anything: series='Mean*'
   dir=PATH         where the run folders are
