@@ -43,6 +43,7 @@ class Figure:
     series: Mapping[str, tuple[str, ...]]  # words for `configs.compose`
     claims: tuple[Claim, ...]
     references: Mapping[str, Line]
+    thesis: Mapping[str, str]  # names of the references there
     num_updates: int  # shown; the thesis trained some series for longer
     num_seeds: int  # from which on there is a verdict
     y: tuple[str, ...]  # the pictures, linear and log
@@ -75,7 +76,8 @@ def load(name: str) -> Figure:
     fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
     fields["y"] = tuple(fields.pop("y", ["linear"]))
     lines = _references(CURVES / f"{reference}.csv") if reference else {}
-    return Figure(name=name, references={own: lines[theirs] for own, theirs in thesis.items() if lines}, **fields)
+    references = {own: lines[theirs] for own, theirs in thesis.items() if lines}
+    return Figure(name=name, references=references, thesis=thesis, **fields)
 
 
 def stored(directory: Path) -> list[RunFolder]:
@@ -139,13 +141,13 @@ def is_of(folder: RunFolder, config: Config) -> bool:
     return configs.read(folder.path / "config.yaml").get("eval_every") == config["eval_every"]
 
 
-def origin(folder: RunFolder) -> str:
-    """What code trained it, on what device; of the last session."""
+def origin(folder: RunFolder) -> tuple[str, str]:
+    """On what device it was trained, and by what revision of the code, in its last session."""
     try:
         manifest = json.loads((folder.path / "manifest.json").read_text())
-        return f"revision {(manifest['git_revision'] or 'unknown')[:12]} on {manifest['device']['backend']}"
+        return manifest["device"]["backend"], (manifest["git_revision"] or "unknown")[:12]
     except (OSError, ValueError, KeyError):
-        return "an unknown revision"
+        return "unknown devices", "unknown"
 
 
 def of_thesis(figure: Figure) -> dict[str, Measured]:
@@ -163,7 +165,8 @@ def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Pa
     """Draws the figure with the curves of the thesis behind ours, and writes the points beside; returns the files."""
     series = [Series(name, ours.line, f"{ours.line.num_seeds.max()} seeds") for name, ours in measured.items()]
     for name, line in figure.references.items():
-        series.append(Series(name, line, f"thesis, {line.num_seeds[0]} runs", is_reference=True))
+        source = "thesis" if figure.thesis[name] == name else f"thesis: {figure.thesis[name]}"
+        series.append(Series(name, line, f"{source}, {line.num_seeds[0]} runs", is_reference=True))
     caption = "Median and quartiles over seeds" + ("; dashed: the thesis" if figure.references else "")
     out.mkdir(parents=True, exist_ok=True)
     files = []

@@ -18,9 +18,11 @@ same for nine of ten redrawings of these seeds (bootstrap); four of five redrawi
 """
 
 
-def page(sections: Sequence[str], origins: Sequence[str]) -> str:
-    """The whole report; `origins` say what the runs were trained with."""
-    return "\n".join([HEAD, f"Trained with {'; '.join(origins)}.\n", *sections])
+def page(sections: Sequence[str], origins: Sequence[tuple[str, str]]) -> str:
+    """The whole report; `origins` are devices and revisions that the runs were trained with."""
+    revisions = {device: sorted({x for other, x in origins if other == device}) for device, _ in sorted(origins)}
+    lines = [f"Trained on {device}, revisions of the code: {', '.join(x)}.\n" for device, x in revisions.items()]
+    return "\n".join([HEAD, *lines, *sections])
 
 
 def section(
@@ -58,7 +60,7 @@ def _verdicts(figure: Figure, measured: Mapping[str, Measured]) -> str:
     rows = [["claim", "verdict", "here", "in the thesis", "accepted"], ["---"] * 5]
     for verdict in experiments.verdicts(figure, measured):
         here, thesis, low, high = (_number(verdict, x) for x in (verdict.here, verdict.thesis, *verdict.interval))
-        here += "" if low == "-" else f" [{low}, {high}]"
+        here += "" if "-" in (here, low) else f" [{low}, {high}]"
         rows.append([verdict.claim.says, verdict.outcome, here, thesis, _range(verdict)])
     return _markdown(rows)
 

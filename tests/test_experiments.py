@@ -377,7 +377,7 @@ def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
     assert f"warning: {odd} is of no figure" in capsys.readouterr().err
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| μ only | 2 |" in report
-    assert "Trained with revision 0123456789ab on cpu." in report
+    assert "Trained on cpu, revisions of the code: 0123456789ab." in report
 
 
 def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):

@@ -91,7 +91,7 @@ def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
     for folder in found:
         if folder.path not in used:
             print(f"warning: {folder.path} is of no figure", file=sys.stderr)
-    origins = sorted({experiments.origin(folder) for folder in found if folder.path in used})
+    origins = [experiments.origin(folder) for folder in found if folder.path in used]
     replace_text(out / "report.md", report.page(sections, origins))
     print(f"wrote {out / 'report.md'}")
     return 0
