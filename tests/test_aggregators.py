@@ -297,7 +297,7 @@ def test_precision_of_softplus_and_its_gradient_over_the_whole_range():
 
 
 @pytest.mark.parametrize("rectifier", ["softplus", "exp"])
-@pytest.mark.parametrize("raw", [-1e30, -200.0, -88.0, 200.0, 1e30])
+@pytest.mark.parametrize("raw", [-1e30, -89.0, 1e30])
 def test_no_variance_is_too_extreme(rectifier, raw):
     model = AGGREGATORS["bayesian"](rectifier=rectifier)
     segments = segments_of(jnp.ones((1, 3), bool))

@@ -87,6 +87,7 @@ def test_absent_agents_surround_nobody():
         jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:20], b[:20]), one, two)
 
 
+@pytest.mark.slow
 def test_derivatives_by_radius_and_side_pass_the_grid_by():
     def spread(numbers, max_neighbors):
         radius, side = numbers

@@ -50,7 +50,7 @@ def test_shuffling_is_a_permutation(rows, columns):
     np.testing.assert_array_equal(np.sort(order.reshape(-1)), np.arange(rows * columns))
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(100, 1), (100, 2), (40, 10), (32, 8)])
+@pytest.mark.parametrize(("rows", "columns"), [(100, 1), (100, 2), (32, 8)])
 def test_neighbours_do_not_follow_each_other(rows, columns):
     """In time, that is: sample i + 1 is in the minibatch after that of sample i as often as any other."""
     keys = jax.random.split(jax.random.key(2), 500)

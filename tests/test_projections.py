@@ -117,7 +117,7 @@ def test_recorded_roots_in_double_precision(meta):
     np.testing.assert_array_less(error, 1e-9)
 
 
-@pytest.mark.parametrize("bound", [1.0, 2.0, 10.0, 30.0])
+@pytest.mark.parametrize("bound", [2.0, 30.0])
 def test_large_bounds_are_met_too(bound):
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):

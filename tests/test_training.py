@@ -138,6 +138,7 @@ def test_every_episode_of_an_update_has_a_start_of_its_own():
         EXPERIMENT.replace(reset_pool=0)
 
 
+@pytest.mark.slow
 def test_a_learner_needs_no_more_than_init_and_update():
     """And none of what on-policy learners share."""
 
