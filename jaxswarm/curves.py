@@ -94,10 +94,9 @@ def summarize(curves: Sequence[Curve], statistic: str) -> Line:
     return Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(values), axis=0))
 
 
-def redrawn(curves: Sequence[Curve], statistic: str, count: int) -> list[Line]:
+def redrawn(curves: Sequence[Curve], statistic: str, count: int, rng: np.random.Generator) -> list[Line]:
     """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of all seeds."""
     grid, values = on_common_grid(curves)
-    rng = np.random.default_rng(0)
     of_all = STATISTICS[statistic].compute(values)
     lines = []
     with warnings.catch_warnings():

@@ -118,7 +118,7 @@ def measure(
 
     As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
     """
-    measured = {}
+    measured, rng = {}, np.random.default_rng(0)
     for series, (trial, *_) in trials.items():
         per_update = trial.experiment.agent_steps_per_update
         end = float(figure.num_updates * per_update)
@@ -127,7 +127,7 @@ def measure(
         if seeds:
             shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
             line = _until(curves.summarize(shifted, "median"), end)
-            redrawn = tuple(_until(one, end) for one in curves.redrawn(shifted, "median", NUM_REDRAWN))
+            redrawn = tuple(_until(one, end) for one in curves.redrawn(shifted, "median", NUM_REDRAWN, rng))
             reference = figure.references.get(series)
             end = min(end, float(reference.x[-1])) if reference else end
             measured[series] = Measured(line, reference or line, end, redrawn)

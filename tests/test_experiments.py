@@ -301,7 +301,7 @@ def test_verdicts_take_that_redrawn_seeds_agree(spread, room, outcome):
     rng, x = np.random.default_rng(0), np.arange(1.0, 101)
     seeds = [Curve(x, np.full(100, 10 + spread * noise)) for noise in rng.normal(size=16)]
     line = curves.summarize(seeds, "median")
-    one = Measured(line, line, 100.0, tuple(curves.redrawn(seeds, "median", 200)))
+    one = Measured(line, line, 100.0, tuple(curves.redrawn(seeds, "median", 200, rng)))
     verdict = judge(Claim("", "final", ("a",), high=line.y[0] + room), {"a": one}, SERIES, enough=16)
     assert verdict.outcome == outcome
     low, high = verdict.interval
