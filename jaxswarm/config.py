@@ -6,15 +6,16 @@ read off the constructors, so nothing here knows any single task, aggregator or 
 """
 
 import dataclasses
-import difflib
 import inspect
 import itertools
 import math
-import types
 import typing
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+from jaxswarm import schema
+from jaxswarm.schema import ConfigError
 
 if TYPE_CHECKING:
     from jaxswarm.training import Experiment
@@ -27,10 +28,6 @@ PARTS = (*REGISTERED, "network")  # what an experiment is made of, one dict each
 SEARCHES = "search"  # the folder of search spaces, which are no part of a config
 FIGURES = "figure"  # that of figures, each of several configs
 LENGTHS = ("num_updates", "total_agent_steps")  # two ways to say the same
-
-
-class ConfigError(ValueError):
-    """Something the user wrote is not possible; the message says what would be."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,35 +260,24 @@ def _fields(part: str, values: dict) -> dict[str, inspect.Parameter]:
     if part == "network":
         from jaxswarm.networks import ActorCritic  # noqa: PLC0415
 
-        fields = _parameters(ActorCritic)
+        fields = schema.parameters(ActorCritic)
         del fields["aggregator"], fields["action_dim"]  # come from other parts
         return fields
     registry = _registries()[part]
     if values.get("name") not in registry:
         raise _unknown_choice(f"{part}.name", values.get("name"), list(registry))
     name = inspect.Parameter("name", inspect.Parameter.KEYWORD_ONLY, annotation=str)
-    return {"name": name} | _parameters(registry[values["name"]])
-
-
-def _parameters(cls: Any) -> dict[str, inspect.Parameter]:
-    """Constructor parameters with resolved annotations; what flax adds to modules is left out."""
-    hints = typing.get_type_hints(cls)
-    is_module = hasattr(cls, "module_paths")
-    return {
-        name: parameter.replace(annotation=hints.get(name, parameter.annotation))
-        for name, parameter in inspect.signature(cls).parameters.items()
-        if not (is_module and name in ("parent", "name"))
-    }
+    return {"name": name} | schema.parameters(registry[values["name"]])
 
 
 def _experiment_fields() -> dict[str, inspect.Parameter]:
     from jaxswarm.training import Experiment  # noqa: PLC0415
 
-    return {name: field for name, field in _parameters(Experiment).items() if name not in PARTS}
+    return {name: field for name, field in schema.parameters(Experiment).items() if name not in PARTS}
 
 
 def _top_fields() -> dict[str, inspect.Parameter]:
-    return _parameters(Run) | _experiment_fields()
+    return schema.parameters(Run) | _experiment_fields()
 
 
 def _check_fields(values: dict, fields: dict[str, inspect.Parameter], part: str, config: Config) -> dict:
@@ -299,7 +285,7 @@ def _check_fields(values: dict, fields: dict[str, inspect.Parameter], part: str,
     for name in values:
         if name not in fields:
             raise _unknown(full_name[name], part, config)
-    given = {name: _check(value, fields[name].annotation, full_name[name]) for name, value in values.items()}
+    given = {name: schema.check(value, fields[name].annotation, full_name[name]) for name, value in values.items()}
     defaults = {name: field.default for name, field in fields.items() if name not in given}
     missing = [name for name, default in defaults.items() if default is inspect.Parameter.empty]
     if missing:
@@ -314,7 +300,7 @@ def _unknown(key: str, prefix: str, config: Config) -> ConfigError:
     every = [*itertools.chain(*fields.values()), *top]
     same_leaf = [name for name in every if name.rpartition(".")[2] == key.rpartition(".")[2]]
     accepted = fields[prefix] if prefix else [*top, *(f"{part}.<field>" for part in PARTS)]
-    return ConfigError(f"unknown key {key!r}; {_nearest(key, same_leaf or every)}accepted: {', '.join(accepted)}")
+    return ConfigError(f"unknown key {key!r}; {schema.nearest(key, same_leaf or every)}accepted: {', '.join(accepted)}")
 
 
 def _choice(group: str, value: Any, accepted: list[str]) -> str:
@@ -324,50 +310,5 @@ def _choice(group: str, value: Any, accepted: list[str]) -> str:
 
 
 def _unknown_choice(group: str, value: Any, accepted: list[str]) -> ConfigError:
-    near = _nearest(str(value), accepted)
+    near = schema.nearest(str(value), accepted)
     return ConfigError(f"{group} = {value!r} does not exist; {near}accepted: {', '.join(accepted)}")
-
-
-def _nearest(word: str, accepted: list[str]) -> str:
-    near = difflib.get_close_matches(word, accepted, n=1, cutoff=0.5 if "." not in word else 0.3)
-    return f"did you mean {near[0]!r}? " if near else ""
-
-
-def _check(value: Any, annotation: Any, name: str) -> Any:
-    """The value as that type; integers pass for floats, nothing else passes for anything else."""
-    for accepted in _members(annotation):
-        if accepted is float and isinstance(value, int | float) and type(value) is not bool and math.isfinite(value):
-            return float(value)
-        if accepted in (bool, int, str, types.NoneType) and type(value) is accepted:
-            return value
-        if typing.get_origin(accepted) is typing.Literal and value in typing.get_args(accepted):
-            return value
-        if typing.get_origin(accepted) is tuple and isinstance(value, list | tuple):
-            element = typing.get_args(accepted)[0]
-            elements = [_check(x, element, f"{name}[{i}]") for i, x in enumerate(value)]
-            if element is not int or min(elements, default=1) >= 1:  # integers in lists are sizes
-                return elements
-    hint = f" (write {int(value)})" if isinstance(value, float) and value.is_integer() else ""
-    raise ConfigError(f"{name} = {value!r} is not possible; accepted: {_describe(annotation)}{hint}")
-
-
-def _members(annotation: Any) -> tuple:
-    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
-    return typing.get_args(annotation) if is_union else (annotation,)
-
-
-def _describe(annotation: Any) -> str:
-    words = {bool: "true, false", int: "an integer, like 8", float: "a number, like 1e-3", str: "text"}
-    described = []
-    for accepted in _members(annotation):
-        if typing.get_origin(accepted) is typing.Literal:
-            described += [str(x) for x in typing.get_args(accepted)]
-        elif typing.get_origin(accepted) is tuple:
-            element = typing.get_args(accepted)[0]
-            named = f"a list of {_describe(element)}"
-            described.append("a list of integers from 1, like [120,60]" if element is int else named)
-        elif accepted is types.NoneType:
-            described.append("null")
-        elif accepted in words:
-            described.append(words[accepted])
-    return ", ".join(described)

@@ -11,7 +11,7 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
-    {"types", "scene"},
+    {"types", "scene", "schema"},
     {"geometry", "contacts", "sets", "distributions"},
     {"dynamics", "neighbors", "shapes", "aggregators.monoids", "aggregators.attentive"},
     {"rigid2d", "tasks.swarm", "tasks.evasion", "aggregators.features"},
