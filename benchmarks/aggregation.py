@@ -1,6 +1,6 @@
 """How fast every aggregator is in every layout; one JSON line per combination.
 
-    python benchmarks/aggregation.py [PATH] [aggregators=mean,max] [rows=4000] [slots=19] [features=64] [repeats=5]
+    python benchmarks/aggregation.py [aggregators=mean,max] [rows=4000] [slots=19] [features=64] [repeats=5] [out=FILE]
 
 A network encodes the 8 features of each entity (one layer), aggregates, and decodes (one layer); times are minima over
 the repeats, of the output and of the output with its gradient with respect to all parameters. All combinations of one
@@ -10,27 +10,23 @@ the others are forced.
 """
 
 import itertools
-import json
-import platform
 import sys
 import time
-from pathlib import Path
 
-import flax
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from timing import report, settings
 
 from jaxswarm import AGGREGATORS, sets
 from jaxswarm.networks import Beside, Encoder
 from jaxswarm.types import Entities
 
 GRID = {
-    "aggregators": [*AGGREGATORS],
-    "rows": [256, 1000, 4000, 16000],
-    "slots": [5, 19, 49],
-    "features": [64, 120],
-    "repeats": [5],
+    "aggregators": ",".join(AGGREGATORS),
+    "rows": "256,1000,4000,16000",
+    "slots": "5,19,49",
+    "features": "64,120",
 }
 OWN, DIM = 3, 8
 
@@ -104,23 +100,11 @@ def measure(names, rows, slots, width, repeats):
 
 
 def main(words):
-    """Prints the results and, given a path, appends them to that file."""
-    path = next((Path(word) for word in words if "=" not in word), None)
-    given = {key: value.split(",") for key, _, value in (word.partition("=") for word in words if "=" in word)}
-    if unknown := [key for key in given if key not in GRID]:
-        raise ValueError(f"{unknown[0]} is not possible; accepted: {', '.join(GRID)}")
-    grid = GRID | {key: value if key == "aggregators" else [int(x) for x in value] for key, value in given.items()}
-    device = jax.devices()[0]
-    versions = {"python": platform.python_version(), "jax": jax.__version__, "flax": flax.__version__}
-    about = {"versions": versions, "device": {"backend": device.platform, "kind": device.device_kind}}
-    for size in itertools.product(grid["rows"], grid["slots"], grid["features"]):
-        for result in measure(grid["aggregators"], *size, grid["repeats"][0]):
-            rounded = {name: float(f"{x:.4g}") if isinstance(x, float) else x for name, x in result.items()}
-            line = json.dumps(rounded | about)
-            print(line, flush=True)
-            if path:
-                with path.open("a") as file:
-                    file.write(line + "\n")
+    given = settings(words, **GRID, repeats="5")
+    sizes = ([int(x) for x in given[name].split(",")] for name in ("rows", "slots", "features"))
+    for size in itertools.product(*sizes):
+        for result in measure(given["aggregators"].split(","), *size, int(given["repeats"])):
+            report(result, given["out"])
 
 
 if __name__ == "__main__":

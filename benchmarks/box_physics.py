@@ -1,6 +1,6 @@
 """How many environment steps a second the box worlds take, beside Box2D from Python on the same scenes.
 
-    python benchmarks/box_physics.py [worlds=1,64,1024] [seconds=2] [physics=faithful]
+    python benchmarks/box_physics.py [worlds=1,64,1024] [seconds=2] [physics=faithful] [out=FILE]
 
 prints one JSON object per line, in seconds of CPU of this one process, so that other processes matter little. `physics`
 rows take steps of 1 s with the same random commands, `environment` rows also make observations and the reward. Box2D
@@ -10,10 +10,8 @@ of the thesis did, and its environment uses NumPy for observations and reward. N
 
 import importlib.metadata
 import itertools
-import json
 import math
 import os
-import platform
 import sys
 import time
 
@@ -24,6 +22,7 @@ if hasattr(os, "sched_setaffinity"):  # one core
 import jax
 import numpy as np
 from Box2D import b2ChainShape, b2CircleShape, b2FixtureDef, b2PolygonShape, b2World
+from timing import report, settings
 
 from jaxswarm.contacts import MAX_SPEED, MAX_TURN_RATE
 from jaxswarm.tasks.boxes import Assembly
@@ -139,32 +138,28 @@ def jaxswarm_rate(task: Assembly, num_worlds: int, is_environment: bool, seconds
 
 
 def main(words: list[str]) -> None:
-    settings = {"worlds": "1,64,1024", "seconds": "2", "physics": "faithful"}
-    settings |= dict(word.split("=", 1) for word in words)
-    seconds = float(settings["seconds"])
-    versions = {name: importlib.metadata.version(name) for name in ("jaxswarm", "jax", "jaxlib", "Box2D")}
+    given = settings(words, worlds="1,64,1024", seconds="2", physics="faithful")
+    seconds = float(given["seconds"])
     for (num_agents, num_boxes, side), kind in itertools.product(SCENES, ("physics", "environment")):
-        task = Assembly(num_agents=num_agents, num_boxes=num_boxes, side=side, physics=settings["physics"])
+        task = Assembly(num_agents=num_agents, num_boxes=num_boxes, side=side, physics=given["physics"])
         is_environment = kind == "environment"
         box2d = box2d_rate(task, is_environment, seconds)
-        for num_worlds in map(int, settings["worlds"].split(",")):
+        for num_worlds in map(int, given["worlds"].split(",")):
             rate, compile_seconds = jaxswarm_rate(task, num_worlds, is_environment, seconds)
             row = {
                 "benchmark": "box_physics",
                 "kind": kind,
                 "robots": num_agents,
                 "boxes": num_boxes,
-                "physics": settings["physics"],
+                "physics": given["physics"],
                 "worlds": num_worlds,
                 "steps_per_cpu_second": rate,
                 "box2d_steps_per_cpu_second": box2d,
                 "ratio": rate / box2d,
                 "compile_seconds": compile_seconds,
-                "versions": versions,
-                "device": jax.devices()[0].device_kind,
-                "platform": platform.platform(),
+                "box2d_version": importlib.metadata.version("Box2D"),
             }
-            print(json.dumps({key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in row.items()}))
+            report(row, given["out"])
 
 
 if __name__ == "__main__":

@@ -8,15 +8,15 @@ states. For pursuit, with one and with five evaders, `evasion_over_observation` 
 that of the observation of the same worlds.
 """
 
-import json
+import itertools
 import sys
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-from timing import seconds
+from timing import report, seconds, settings
 
-from jaxswarm import TASKS, reporting
+from jaxswarm import TASKS
 from jaxswarm.tasks.evasion import flight
 
 TASK_FIELDS = {
@@ -75,28 +75,19 @@ def measure(name, num_worlds, num_agents, repeats):
         "task": name,
         "num_worlds": num_worlds,
         "num_agents": num_agents,
-        "environment_steps_per_second": round(rate),
-        "agent_steps_per_second": round(rate * num_agents),
+        "environment_steps_per_second": rate,
+        "agent_steps_per_second": rate * num_agents,
     }
     if task_name == "pursuit":
-        result["evasion_over_observation"] = round(evasion_over_observation(task, key, num_worlds, repeats), 3)
+        result["evasion_over_observation"] = evasion_over_observation(task, key, num_worlds, repeats)
     return result
 
 
-def main(arguments):
-    options = {"worlds": "1,64,1024,8192", "agents": "10,50,200", "repeats": "3", "out": ""}
-    options["tasks"] = ",".join(TASK_FIELDS)
-    options |= dict(argument.split("=", 1) for argument in arguments)
-    worlds, agents = ([int(number) for number in options[name].split(",")] for name in ("worlds", "agents"))
-    about = reporting.provenance()
-    for name in options["tasks"].split(","):
-        for num_agents in agents:
-            for num_worlds in worlds:
-                line = json.dumps(measure(name, num_worlds, num_agents, int(options["repeats"])) | about)
-                print(line, flush=True)
-                if options["out"]:
-                    with open(options["out"], "a", encoding="utf-8") as file:
-                        file.write(line + "\n")
+def main(words):
+    given = settings(words, tasks=",".join(TASK_FIELDS), worlds="1,64,1024,8192", agents="10,50,200", repeats="3")
+    worlds, agents = ([int(number) for number in given[name].split(",")] for name in ("worlds", "agents"))
+    for name, num_agents, num_worlds in itertools.product(given["tasks"].split(","), agents, worlds):
+        report(measure(name, num_worlds, num_agents, int(given["repeats"])), given["out"])
 
 
 if __name__ == "__main__":

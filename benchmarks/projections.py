@@ -1,13 +1,12 @@
 """What trust region layers cost, side by side in one process; prints one JSON object a line.
 
-    python benchmarks/projections.py [rows=4096] [repeats=200]
+    python benchmarks/projections.py [rows=4096] [repeats=200] [out=FILE]
 
 `call`: microseconds of projecting a batch, and of its log-probability. `loss`: microseconds of loss and gradient of TRL
 and of PPO on the same batch, of outputs that are parameters themselves (so nothing hides the layer), and of the default
 network on observations of rendezvous. Every line has the ratio to what it is compared with.
 """
 
-import json
 import sys
 import time
 from functools import partial
@@ -15,11 +14,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import report, settings
 
-from jaxswarm import LEARNERS, config, reporting
+from jaxswarm import LEARNERS, config
 from jaxswarm.distributions import gaussian
 from jaxswarm.learners.on_policy import Batch
 from jaxswarm.learners.projections import PROJECTIONS
+from jaxswarm.types import Observation
 
 BOUNDS = {"mean_bound": 0.03, "cov_bound": 0.001}
 
@@ -61,7 +62,8 @@ def changed(num_rows: int, dim: int, is_shared: bool) -> tuple[dict, dict, Batch
     policy = gaussian(old["mean"], old["log_std"])
     action = policy.sample(seed=keys[4])
     advantage, target = jax.random.normal(keys[5], (2, num_rows))
-    return new, old, Batch(None, action, policy.log_prob(action), advantage, target, policy.mean(), policy.stddev())
+    obs = Observation(jnp.zeros((num_rows, 0)), {})
+    return new, old, Batch(obs, action, policy.log_prob(action), advantage, target, policy.mean(), policy.stddev())
 
 
 def calls(num_rows: int, dim: int) -> dict:
@@ -102,8 +104,8 @@ def on_rendezvous(num_rows: int, std: str) -> tuple:
 
 
 def main(words: list[str]) -> None:
-    sizes = {"rows": 4096, "repeats": 200} | {key: int(x) for key, _, x in (word.partition("=") for word in words)}
-    num_rows, repeats = sizes["rows"], sizes["repeats"]
+    given = settings(words, rows="4096", repeats="200")
+    num_rows, repeats = int(given["rows"]), int(given["repeats"])
     cases = [({"benchmark": "call", "dim": dim}, lambda dim=dim: calls(num_rows, dim)) for dim in (2, 8)]
     for std in ("shared", "state"):
         for dim in (2, 8):
@@ -115,14 +117,12 @@ def main(words: list[str]) -> None:
             cases.append(({"benchmark": "loss", "of": "outputs", "std": std, "dim": dim}, outputs))
         network = {"benchmark": "loss", "of": "network", "std": std, "dim": 2}
         cases.append((network, lambda std=std: losses(*on_rendezvous(num_rows, std))))
-    manifest = reporting.manifest(config.build(config.compose()), 0, 0)
-    machine = {key: manifest[key] for key in ("versions", "device", "platform", "git_revision")}
     for case, functions in cases:
         times = microseconds(functions(), repeats)
         (reference, least), *others = times.items()
-        result = {"rows": num_rows, reference: round(least, 1)}
-        result |= {name: {"microseconds": round(t, 1), f"of_{reference}": round(t / least, 2)} for name, t in others}
-        print(json.dumps(case | result | machine), flush=True)
+        result = {"rows": num_rows, reference: least}
+        result |= {name: {"microseconds": t, f"of_{reference}": t / least} for name, t in others}
+        report(case | result, given["out"])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How long several seeds take side by side, over one seed, and how much memory; one JSON line for each number of seeds.
 
-    python benchmarks/seeds.py [seeds=1,4,16,64] [width=N] [updates=3] [out=PATH] [group=choice | key=value] ...
+    python benchmarks/seeds.py [seeds=1,4,16,64] [width=N] [updates=3] [out=FILE] [group=choice | key=value] ...
 
 The other words describe the experiment as for jaxswarm-train. Every number of seeds has a process of its own, so that
 peak memory is its own, too; times are minima over the updates. `width` seeds are trained at a time, the rest after
@@ -12,15 +12,13 @@ import json
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
-from timing import peak_memory
+from timing import peak_memory, report
 
 from jaxswarm import config, ensemble
 from jaxswarm.cli.words import split, use_compile_cache, use_cores
-from jaxswarm.reporting import provenance
 
 
 def measure(num_seeds, num_updates, words):
@@ -66,12 +64,7 @@ def main(words):
         result = {"benchmark": "seeds", "words": words} | json.loads(output.splitlines()[-1])
         of_one = of_one or result["seconds_per_update"] / result["num_seeds"]
         result["over_one_seed"] = result["seconds_per_update"] / of_one
-        rounded = {name: float(f"{x:.4g}") if isinstance(x, float) else x for name, x in result.items()}
-        line = json.dumps(rounded | provenance())
-        print(line, flush=True)
-        if "out" in options:
-            with Path(options["out"]).open("a") as file:
-                file.write(line + "\n")
+        report(result, options.get("out", ""))
 
 
 if __name__ == "__main__":

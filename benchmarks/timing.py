@@ -1,10 +1,34 @@
-"""What the benchmarks share: times of calls, the speed of the machine, memory."""
+"""What the benchmarks share: words in, lines of JSON out, times of calls, the speed of the machine, memory."""
 
+import json
 import resource
 import statistics
 import time
 
 import jax
+
+from jaxswarm import reporting
+
+
+def settings(words: list[str], **defaults: str) -> dict[str, str]:
+    """The values of `key=value` words over the defaults; a `ValueError` says which keys there are."""
+    for word in words:
+        key, equals, _ = word.partition("=")
+        if not equals or key not in (*defaults, "out"):
+            raise ValueError(
+                f"{word} is not possible; accepted: {', '.join(f'{key}=...' for key in (*defaults, 'out'))}"
+            )
+    return {"out": ""} | defaults | dict(word.split("=", 1) for word in words)
+
+
+def report(result: dict, out: str = "") -> None:
+    """Prints the result as a line of JSON, to four digits and with where it was measured, and appends it to a file."""
+    rounded = json.loads(json.dumps(result), parse_float=lambda x: float(f"{float(x):.4g}"))
+    line = json.dumps(rounded | reporting.provenance())
+    print(line, flush=True)
+    if out:
+        with open(out, "a", encoding="utf-8") as file:
+            file.write(line + "\n")
 
 
 def seconds(function, *args, repeats: int) -> float:

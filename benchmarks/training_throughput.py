@@ -1,22 +1,22 @@
 """How fast a training setting compiles, steps and learns; prints one JSON object.
 
-    python benchmarks/training_throughput.py [group=choice | key=value ...] [repeats=3]
+    python benchmarks/training_throughput.py [group=choice | key=value ...] [repeats=3] [out=FILE]
 
 takes the words of `jaxswarm-train`, for instance `experiment=rendezvous_thesis aggregator=bayesian`. `gemm_fraction` is
 the useful matrix-multiply FLOP/s of the update over those of a 2048 x 2048 float32 matrix product timed in the same
 process: recomputed activations and everything that is no matrix product count for nothing.
 """
 
-import json
 import statistics
 import sys
 import time
 from functools import partial
 
 import jax
-from timing import gemm_flops, peak_memory, seconds
+from timing import gemm_flops, peak_memory, report, seconds
 
-from jaxswarm import config, init, reporting, rollout, train
+from jaxswarm import config, init, rollout, train
+from jaxswarm.cli.words import split
 from jaxswarm.training import Experiment, evaluate
 
 
@@ -41,8 +41,8 @@ def useful_flops(experiment: Experiment, params: dict) -> int:
 
 
 def main(words: list[str]) -> None:
-    repeats = next((int(word.partition("=")[2]) for word in words if word.startswith("repeats=")), 3)
-    words = [word for word in words if not word.startswith("repeats=")]
+    options, words = split(words, ("repeats", "out"))
+    repeats = int(options.get("repeats", 3))
     experiment = config.build(config.compose(words))
     state = jax.jit(init)(experiment, jax.random.key(0))
 
@@ -56,7 +56,7 @@ def main(words: list[str]) -> None:
     @jax.jit
     def collect(state):
         policy = partial(experiment.network.apply, state.learner.params, method="policy")
-        sizes = experiment.num_steps, experiment.reset_pool
+        sizes = experiment.num_steps, experiment.num_start_states
         return rollout.collect(jax.random.key(1), experiment.task, policy, state.worlds, *sizes)
 
     @jax.jit
@@ -89,8 +89,7 @@ def main(words: list[str]) -> None:
         "gemm_gflops": gemm / 1e9,
         "gemm_fraction": flops / gemm,
     }
-    rounded = {name: float(f"{x:.4g}") if isinstance(x, float) else x for name, x in result.items()}
-    print(json.dumps(rounded | reporting.provenance()))
+    report(result, options.get("out", ""))
 
 
 if __name__ == "__main__":
