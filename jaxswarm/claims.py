@@ -149,8 +149,9 @@ def _spread(_: Claim, series: Sequence[Measured]) -> float:
     return float(np.ptp(_finals(series)))
 
 
-def _order(_: Claim, series: Sequence[Measured]) -> float:
-    return float(-np.diff(_finals(series)).max())
+def _overlap(_: Claim, series: Sequence[Measured]) -> float:
+    lower, upper = ([one.final(getattr(one.line, name)) for one in series] for name in ("lower", "upper"))
+    return min(upper) - max(lower)
 
 
 def _lead(claim: Claim, series: Sequence[Measured]) -> float:
@@ -169,7 +170,7 @@ KINDS: dict[str, Callable[[Claim, Sequence[Measured]], float]] = {
     "lower_quartile": lambda _, series: series[0].final(series[0].line.lower),  # of the final level
     "difference": lambda _, series: series[0].final() - series[1].final(),  # of two final levels
     "spread": _spread,  # between the highest and the lowest final level
-    "order": _order,  # the smallest distance of a final level to that of the next series
+    "overlap": _overlap,  # of what lies between the quartiles of the final levels
     "level": lambda claim, series: min(one.at(claim.at) for one in series),  # the lowest of the series, at a point
     "lead": _lead,  # at a point, of the first series over the best of the others
     "steps": lambda claim, series: series[0].steps_to(claim.fraction),  # to a fraction of the way
