@@ -115,7 +115,7 @@ def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measu
         outcome = "not enough runs"
     else:
         outcome = "reproduced" if claim.holds(here) else "not reproduced"
-    numbers = np.nan_to_num(redrawn, nan=math.inf)  # steps to where it never gets
+    numbers = np.nan_to_num(redrawn, nan=math.inf, posinf=math.inf)  # steps to where it never gets
     low, high = np.percentile(numbers, [10, 90], method="nearest") if redrawn else (math.nan, math.nan)
     return Verdict(claim, outcome, here, thesis, num_seeds, (float(low), float(high)))
 
@@ -160,8 +160,9 @@ def _lead(claim: Claim, series: Sequence[Measured]) -> float:
 
 
 def _pace(claim: Claim, series: Sequence[Measured]) -> float:
-    first, second = (one.steps_to(claim.fraction) for one in series)
-    first, second = (math.inf if math.isnan(steps) else steps for steps in (first, second))  # never
+    steps = [one.steps_to(claim.fraction) for one in series]
+    is_never = [math.isnan(x) and not one.is_cut for x, one in zip(steps, series, strict=True)]
+    first, second = np.where(is_never, math.inf, steps).tolist()
     return first / second  # NaN if both are infinite
 
 

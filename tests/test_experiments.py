@@ -276,6 +276,15 @@ def test_never_is_longer_than_any_time():
     assert claim.number({"a": SERIES["a"], "b": never}) == 0
     assert claim.number({"a": never, "b": SERIES["a"]}) == math.inf
     assert math.isnan(claim.number({"a": never, "b": never}))
+    cut = dataclasses.replace(never, line=ramp(2.0, 40.0, end=50.0))
+    assert math.isnan(claim.number({"a": cut, "b": SERIES["a"]}))
+
+
+def test_the_range_of_what_is_never_reached_is_never():
+    never = dataclasses.replace(SERIES["c"], line=ramp(2.0, 40.0), redrawn=(ramp(2.0, 40.0),) * 10)
+    ours = {"a": never, "b": dataclasses.replace(SERIES["a"], redrawn=(SERIES["a"].line,) * 10)}
+    verdict = judge(Claim("", "pace", ("a", "b"), fraction=0.9, high=1.0), ours, SERIES, enough=16)
+    assert (verdict.outcome, verdict.here, verdict.interval) == ("not reproduced", math.inf, (math.inf, math.inf))
 
 
 @pytest.mark.parametrize(
