@@ -178,7 +178,7 @@ def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
     if len(lengths) == 1:
         config |= dict.fromkeys(set(LENGTHS) - lengths)
     for key, value in pairs:
-        head, _, tail = _full_key(key, config).partition(".")
+        head, _, tail = full_key(key, config).partition(".")
         if not tail:
             if isinstance(config.get(key), dict):
                 raise ConfigError(f"{key} = {value!r} is not possible; accepted: {key}.<field>=value")
@@ -190,8 +190,8 @@ def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
     return validate(config)
 
 
-def _full_key(key: str, config: Config) -> str:
-    """A field's name stands for `part.name` where only one part has it."""
+def full_key(key: str, config: Config) -> str:
+    """The key in full: a field's name stands for `part.name` where only one part has it."""
     if "." in key or key in config or key in _top_fields():
         return key
     owners = [part for part in PARTS if key in _fields(part, config[part])]

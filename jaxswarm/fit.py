@@ -265,6 +265,7 @@ class _Desk:
         for recorder, part in self._parts():
             own = None if evaluation is None else {name: x[part] for name, x in evaluation.items()}
             recorder.finish(update, self._wall_seconds, _sliced(states, part), own)
+        self._report_diverged()
 
     def _parts(self) -> Iterator[tuple[Recorder, slice]]:
         """Each recorder with its part of the axis of runs."""

@@ -170,7 +170,9 @@ class Recorder:
     def _add_rows(self, update: int, wall_seconds: float, evaluation: dict[str, np.ndarray]) -> None:
         """Evaluations of the policies at `update`, and means over the updates since the rows before."""
         for index, seed in enumerate(self.run.seeds):
-            if seed in self.reason or not np.isfinite(evaluation[RETURN][index]):
+            if seed not in self.reason and not np.isfinite(evaluation[RETURN][index]):
+                self.reason[seed] = f"{RETURN} is {evaluation[RETURN][index]} at update {update}"
+            if seed in self.reason:
                 continue
             means = {name: _nanmean([x[index] for x in values]) for name, values in self._since_evaluation.items()}
             row = {
@@ -209,7 +211,7 @@ def draw_curve(run: Run, rows: Sequence[Row]) -> None:
 def _reason(metrics: dict[str, Any], update: int) -> str:
     """Which number stopped being finite."""
     for name, value in metrics.items():
-        if not np.isfinite(value) and (is_loss(name) or (name == RETURN and np.isinf(value))):
+        if not np.isfinite(value) and is_loss(name):
             return f"{name} is {value} at update {update}"
     return f"a parameter is not finite at update {update}"
 

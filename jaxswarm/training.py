@@ -116,7 +116,8 @@ def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
 
 @jax.jit  # traced once, for its shapes and for the loop
 def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[TrainState, Metrics]:
-    eval_metrics = _evaluate_if(state.update % experiment.eval_every == 0, experiment, state)
+    is_due = state.update % experiment.eval_every == 0
+    eval_metrics = _evaluate_if(is_due, experiment, state)
     rollout_key, learner_key = jax.random.split(jax.random.fold_in(_update_key(state), 1))
     worlds, trajectory, train_metrics = rollout.collect(
         rollout_key,
@@ -133,15 +134,16 @@ def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[Tra
     metrics |= {f"learner/{name}": x for name, x in learner_metrics.items()}
     after = TrainState(state.update + 1, state.key, learner, worlds, state.is_finite)
     is_finite = state.is_finite & _are_finite(learner.params, metrics)
+    is_finite &= jnp.isfinite(metrics["eval/return"]) | ~is_due
     kept = jax.tree.map(lambda a, b: jnp.where(is_finite, a, b), after, state)
     return dataclasses.replace(kept, is_finite=is_finite), metrics | {"is_finite": is_finite.astype(jnp.float32)}
 
 
 def _are_finite(params: Any, metrics: Metrics) -> Bool[Array, ""]:
-    """Parameters and losses; and the return, where there was an evaluation."""
+    """Parameters and losses."""
     losses = {name: x for name, x in metrics.items() if is_loss(name)}
     checks = jax.tree.map(lambda x: jnp.isfinite(x).all(), (params, losses))
-    return jax.tree.reduce(jnp.logical_and, checks, ~jnp.isinf(metrics["eval/return"]))
+    return jax.tree.reduce(jnp.logical_and, checks)
 
 
 def is_loss(name: str) -> bool:

@@ -8,10 +8,11 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxswarm import checkpoint, reporting
+from jaxswarm import checkpoint, reporting, rollout
 from jaxswarm import config as configs
 from jaxswarm.cli import evaluate, train
 from jaxswarm.fit import abstract_state
@@ -131,7 +132,7 @@ def test_help_shows_groups_choices_and_keys(capsys):
     assert "task.num_agents=5,10" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [[], ["checkpoint=last", "task.num_agents=7", "episodes=3"]])
+@pytest.mark.parametrize("words", [[], ["checkpoint=last", "num_agents=7", "episodes=3"]])
 def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, words):
     assert evaluate.main([str(finished), "seed=1", *words]) == 0
     out = capsys.readouterr().out
@@ -155,6 +156,17 @@ def test_a_policy_is_evaluated_in_swarms_of_several_sizes(finished, capsys):
     assert len(set(table["return"])) == 4
 
 
+def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch):
+    monkeypatch.setattr(rollout, "evaluate", lambda *_: {"return": jnp.ones(()), "capture_time": jnp.full((), jnp.nan)})
+    assert evaluate.main([str(finished)]) == 0
+    *_, table, wrote = capsys.readouterr().out.splitlines()
+    assert table.split() == ["capture_time", "-"]
+    text = Path(wrote.removeprefix("wrote ")).read_text()
+    (played,) = json.loads(text, parse_constant=pytest.fail)["results"]
+    assert played["metrics"] == {"return": 1.0, "capture_time": None}
+    assert played["of_each_seed"] == {"return": [1.0], "capture_time": [None]}
+
+
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -162,6 +174,7 @@ def test_a_policy_is_evaluated_in_swarms_of_several_sizes(finished, capsys):
         (["episodes=0"], "episodes = 0"),
         (["episodes=many"], "episodes = many"),
         (["num_worlds=3"], "num_worlds cannot be changed here"),
+        (["episode=3"], "did you mean 'episodes'"),
         (["task.num_agent=3"], "did you mean 'task.num_agents'"),
         (["task.num_agents=0"], "num_agents = 0"),
         (["task.dynamics=velocity"], "observations of other sizes"),

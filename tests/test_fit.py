@@ -14,6 +14,8 @@ from jaxswarm import fit as fitting
 from jaxswarm.config import ConfigError
 from jaxswarm.fit import DivergedError, fit
 from jaxswarm.recording import Recorder, locked
+from jaxswarm.tasks import Rendezvous
+from jaxswarm.types import pytree
 
 WORDS = (
     "task.num_agents=3 task.episode_length=5 num_worlds=2 num_steps=4 learner.batch_size=12 eval_worlds=2 eval_every=3 "
@@ -190,3 +192,19 @@ def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkp
         fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)
     restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(restored.train_state.learner.params))
+
+
+@pytree
+class Unrewarded(Rendezvous):
+    """Whose reward is no number."""
+
+    def step(self, key, state, action):
+        state, outcome = super().step(key, state, action)
+        return state, outcome.replace(reward=outcome.reward * jax.numpy.nan)
+
+
+@pytest.mark.slow
+def test_a_return_that_is_no_number_stops_the_run_and_is_named():
+    experiment = EXPERIMENT.replace(task=Unrewarded(num_agents=3, episode_length=5))
+    with pytest.raises(DivergedError, match="eval/return is nan at update 0"):
+        fit(experiment, NUM_UPDATES, progress=False)

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from jaxswarm import config as configs
 from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
-from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.words import load, only_of_task, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
@@ -23,6 +24,7 @@ examples
   jaxswarm-eval runs/thesis
   jaxswarm-eval runs/thesis episodes=100 checkpoint=last task.num_agents=5,10,20,50,100,200
 """
+OPTIONS = ("checkpoint", "episodes", "seed", "train_seed")
 
 
 @program
@@ -32,9 +34,7 @@ def main(arguments: Sequence[str]) -> int:
         print(HELP)
         return 0 if arguments else 2
     paths = [word for word in arguments if "=" not in word]
-    options, words = split(
-        [word for word in arguments if "=" in word], ("checkpoint", "episodes", "seed", "train_seed")
-    )
+    options, words = split([word for word in arguments if "=" in word], OPTIONS)
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
     which = which_checkpoint(options)
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> int:
     episodes = whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
     seed = whole("seed", options.get("seed", 0), 0)
     changes = configs.combinations(words)
-    only(changes[0], lambda key: key.startswith("task."), "task.<field>=value")
+    only_of_task(changes[0], config, OPTIONS)
     asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": which_seeds(options, config)}
     result = _evaluate(Path(paths[0]), config, changes, asked)
     return _report(Path(paths[0]), result) if result else 1
@@ -78,11 +78,22 @@ def _evaluate(
     results = []
     for pairs, task, with_leaves in zip(changes, tasks, built, strict=True):
         of_seeds = {name: np.float64(x) for name, x in play(policies.params, with_leaves).items()}
-        means = {name: float(x.mean()) for name, x in of_seeds.items()}
-        each = {name: x.tolist() for name, x in of_seeds.items()}
+        means = {name: _mean(x) for name, x in of_seeds.items()}
+        each = {name: [_number(x) for x in values.tolist()] for name, values in of_seeds.items()}
         results.append({"changed": dict(pairs), "task": task, "metrics": means, "of_each_seed": each})
     found = {"update": policies.update, "score_in_training": policies.score, "device": jax.devices()[0].device_kind}
     return asked | found | {"results": results}
+
+
+def _number(value: float) -> float | None:
+    """`None`, which JSON has a word for, in place of NaN."""
+    return value if math.isfinite(value) else None
+
+
+def _mean(values: Any) -> float | None:
+    """Of those that are numbers."""
+    finite = [x for x in values.tolist() if math.isfinite(x)]
+    return math.fsum(finite) / len(finite) if finite else None
 
 
 def _report(run_dir: Path, result: dict[str, Any]) -> int:
@@ -91,7 +102,7 @@ def _report(run_dir: Path, result: dict[str, Any]) -> int:
     name = f"eval-{result['which']}-{time.strftime('%Y%m%d-%H%M%S')}"
     while (path := run_dir / f"{name}.json").exists():
         name += "x"
-    replace_text(path, json.dumps(result, indent=2) + "\n")
+    replace_text(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
     num_seeds = len(result["train_seeds"])
     seeds = f" of each of {num_seeds} seeds; means" if num_seeds > 1 else ""
     print(
@@ -106,7 +117,11 @@ def _table(results: Sequence[dict[str, Any]]) -> str:
     """A row per metric, returns first; a column per changed task."""
     metrics = sorted(results[0]["metrics"], key=lambda name: not name.startswith("return"))
     rows = [[key, *[str(result["changed"][key]) for result in results]] for key in results[0]["changed"]]
-    rows += [[name, *[f"{result['metrics'][name]:.4f}" for result in results]] for name in metrics]
+    rows += [[name, *[_cell(result["metrics"][name]) for result in results]] for name in metrics]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     cells = [[x.rjust(width) for x, width in zip(row, widths, strict=True)] for row in rows]
     return "\n".join("  ".join(["", row[0].ljust(widths[0]), *line[1:]]) for row, line in zip(rows, cells, strict=True))
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"

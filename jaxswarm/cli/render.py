@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxswarm import config as configs
 from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
-from jaxswarm.cli.words import load, only, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.words import load, only_of_task, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     seed = whole("seed", options.get("seed", 0), 0)
     sizes = {name: whole(name, options[name], 1) for name in ("frames", "until") if name in options}
     pairs = configs.parse(words)
-    only(pairs, lambda key: key.startswith("task."), "task.<field>=value")
+    only_of_task(pairs, load(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "replay.html"))
     use_compile_cache()
     from jaxswarm import render  # noqa: PLC0415

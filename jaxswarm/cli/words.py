@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
+from jaxswarm import schema
 from jaxswarm.config import Config, ConfigError
 
 
@@ -57,11 +58,21 @@ def split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, str
     return options, words
 
 
-def only(pairs: Sequence[tuple[str, Any]], is_accepted: Callable[[str], bool], accepted: str) -> None:
-    """Raises a `ConfigError` for the first key that is not accepted."""
+def only(
+    pairs: Sequence[tuple[str, Any]], is_accepted: Callable[[str], bool], accepted: str, options: Sequence[str] = ()
+) -> None:
+    """Raises a `ConfigError` for the first key that is not accepted; one of the program's options may be meant."""
     for key, _ in pairs:
         if not is_accepted(key):
-            raise ConfigError(f"{key} cannot be changed here; accepted: {accepted}")
+            near = schema.nearest(key, list(options))
+            raise ConfigError(f"{key} cannot be changed here; {near}accepted: {accepted}")
+
+
+def only_of_task(pairs: Sequence[tuple[str, Any]], config: Config, options: Sequence[str]) -> None:
+    """Raises a `ConfigError` for the first key that is none of the task's."""
+    keys = [f"{name}=..." for name in options]
+    accepted = ", ".join(["task.<field>=value", *keys])
+    only(pairs, lambda key: configs.full_key(key, config).startswith("task."), accepted, options)
 
 
 def whole(name: str, value: Any, least: int) -> int:
