@@ -74,7 +74,7 @@ class Claim:
     fraction: float = math.nan  # of the way to the final level, of the kinds that ask when
 
     def number(self, series: Mapping[str, Measured]) -> float:
-        """What the claim is about; NaN where a series never gets there."""
+        """What the claim is about; NaN if not known, of `pace` infinite or 0 where one series never gets there."""
         return KINDS[self.kind](self, [series[name] for name in self.series])
 
     def needs(self, one: Measured) -> float:

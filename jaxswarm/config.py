@@ -1,14 +1,17 @@
 """What a user writes about a run: YAML groups and `key=value` words in, an `Experiment` out.
 
 A group's file names a registered class and the fields it is built with. Which keys exist and what values they take is
-read off the constructors, so nothing here knows any single task, aggregator or learner. All that is wrong is a
-`ConfigError` of one line, raised before anything is compiled.
+read off the constructors, so nothing here knows any single task, aggregator or learner. What a user has registered by
+a file of `imports` is a choice without a file here. All that is wrong is a `ConfigError` of one line, raised before
+anything is compiled.
 """
 
 import dataclasses
+import importlib.util
 import inspect
 import itertools
 import math
+import sys
 import typing
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -42,6 +45,7 @@ class Run:
     keep_checkpoints: int = 3
     render_every: int | None = None
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    imports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.num_updates is None) == (self.total_agent_steps is None):
@@ -81,7 +85,14 @@ def choices() -> dict[str, list[str]]:
     """Names of the groups, and of the files in each."""
     others = (SEARCHES, FIGURES)
     groups = sorted(path for path in config_dir().iterdir() if path.is_dir() and path.name not in others)
-    return {group.name: sorted(path.stem for path in group.glob("*.yaml")) for group in groups}
+    return {group.name: sorted(path.stem for path in group.glob("*.yaml")) + _own(group.name) for group in groups}
+
+
+def _own(group: str) -> list[str]:
+    """Names that files of `imports` have registered."""
+    if group not in REGISTERED or not _imported:
+        return []
+    return sorted(name for name, cls in _registries()[group].items() if not cls.__module__.startswith("jaxswarm."))
 
 
 def compose(words: Sequence[str] = ()) -> Config:
@@ -95,22 +106,54 @@ def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
     from hydra.errors import HydraException  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
 
+    pairs = [(key, _import(value)) if key == "imports" else (key, value) for key, value in pairs]
     groups = choices()
     chosen = {
         key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and (key, value) != NO_PRESET
     }
+    own = {group: {"name": choice} for group, choice in chosen.items() if choice in _own(group)}
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            composed = compose("train", [f"{group}={choice}" for group, choice in chosen.items()])
+            composed = compose("train", [f"{group}={x}" for group, x in chosen.items() if group not in own])
     except HydraException as error:
         raise ConfigError(" ".join(str(error).split())) from error
-    config = typing.cast(Config, OmegaConf.to_container(composed, resolve=True))
+    config = typing.cast(Config, OmegaConf.to_container(composed, resolve=True)) | own
     return override(config, [(key, value) for key, value in pairs if key not in groups])
 
 
 def load(path: Path) -> Config:
-    """The config of a run, as `dump` wrote it."""
-    return validate(read(path))
+    """The config of a run, as `dump` wrote it; imports what it was trained with."""
+    config = read(path)
+    _import(config.get("imports", []))
+    return validate(config)
+
+
+_imported: set[str] = set()  # once in a process
+
+
+def _import(places: Any) -> Any:
+    """Runs files or modules that register a user's own tasks, aggregators and learners; returns files as full paths."""
+    places = [places] if isinstance(places, str) else places
+    if not isinstance(places, list) or not all(isinstance(place, str) for place in places):
+        return places  # which `validate` says
+    full = [str(Path(place).resolve()) if place.endswith(".py") else place for place in places]
+    for place in full:
+        if place not in _imported:
+            try:
+                _import_file(place) if place.endswith(".py") else importlib.import_module(place)
+            except Exception as error:  # whatever a user's file leads to
+                raise ConfigError(f"cannot import {place}: {type(error).__name__}: {error}") from error
+            _imported.add(place)
+    return full
+
+
+def _import_file(path: str) -> None:
+    name = f"imported_{len(_imported)}_{Path(path).stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[name] = importlib.util.module_from_spec(spec)  # where annotations are looked up
+    spec.loader.exec_module(sys.modules[name])
 
 
 def read(path: Path) -> Config:
@@ -213,15 +256,20 @@ def validate(config: Config) -> Config:
 
 def build(config: Config) -> "Experiment":
     """The experiment that a config describes; a `ConfigError` says which size is impossible."""
+    import jax  # noqa: PLC0415
+
     from jaxswarm.networks import ActorCritic  # noqa: PLC0415
-    from jaxswarm.training import Experiment  # noqa: PLC0415
+    from jaxswarm.training import Experiment, init  # noqa: PLC0415
 
     try:
         task = build_part("task", config)
         fields = _tuples(config["network"])
         network = ActorCritic(**fields, aggregator=build_part("aggregator", config), action_dim=task.action_dim)
         sizes = {name: config[name] for name in _experiment_fields()}
-        return Experiment(task, network, build_part("learner", config), **sizes)
+        experiment = Experiment(task, network, build_part("learner", config), **sizes)
+        if network.latent_space == "shared":  # which not every aggregator can, with some groups
+            jax.eval_shape(init, experiment, jax.random.key(0))
+        return experiment
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:

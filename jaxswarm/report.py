@@ -13,8 +13,9 @@ HEAD = """\
 
 Medians over seeds. The final level is the mean of the last tenth of a curve, with quartiles where there are any. Steps
 are millions of agent steps to a share of the way from the start to the final level of the thesis's curve; a dash means
-never. A verdict takes all seeds that a figure asks for, trained as far as the claim looks, and that it would be the
-same for nine of ten redrawings of these seeds (bootstrap); four of five redrawings give numbers within the brackets.
+not within what was trained. A verdict takes all seeds that a figure asks for, trained as far as the claim looks, and
+that it would be the same for nine of ten redrawings of these seeds (bootstrap); four of five redrawings give numbers
+within the brackets.
 """
 
 

@@ -67,7 +67,7 @@ def provenance() -> dict[str, Any]:
     device = jax.devices()[0]
     return {
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES},
-        "platform": platform.platform(),
+        "platform": f"{platform.system()} {platform.machine()}",
         "device": {"backend": device.platform, "kind": device.device_kind, "count": jax.device_count()},
         "git_revision": _git_revision(),
     }
@@ -177,7 +177,7 @@ class Progress:
             print(f"compiled in {time.monotonic() - self._started:.0f} s; training ...", flush=True)
 
     def advance(self, update: int, evaluation: float | None) -> None:
-        """Shows that so many updates are done; `evaluation` is the latest mean return."""
+        """Shows that so many updates are done; `evaluation` is the latest return."""
         now = time.monotonic()
         self._update = update
         self._first = self._first or (now, update)

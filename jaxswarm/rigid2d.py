@@ -35,7 +35,7 @@ from jaxswarm.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver
 from jaxswarm.shapes import find_contacts, hold_discs, no_impulses
 from jaxswarm.types import pytree
 
-# Boxes that are pressed together overlap by up to 0.1 mm in the first, and by some millimetres in the second.
+# Boxes that are pressed together overlap by up to 0.2 mm in the first, and by some millimetres in the second.
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5)}
 
 BLOCK = 64  # worlds; measured, see benchmarks/LOG.md

@@ -128,6 +128,12 @@ def test_help_shows_groups_choices_and_keys(capsys):
     assert train.main(["--help"]) == 0
     out = capsys.readouterr().out
     assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_worlds: 32", "resume=PATH"))
+    assert train.main(["task=pursuit_multi", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(
+        part in out for part in ("keys of task=pursuit_multi", "task.num_evaders: 5", "learner.clip_range: 0.2 #")
+    )
+    assert "task.num_evaders: 1" not in out
     assert evaluate.main(["-h"]) == 0
     assert "task.num_agents=5,10" in capsys.readouterr().out
 
@@ -236,3 +242,24 @@ def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(cache, tmp_pat
     assert [state.update for state in states] == [3000, 3000]
     for a, b in zip(*(jax.tree.leaves(state.train_state.learner) for state in states), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(cache, tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import jaxswarm\nfrom jaxswarm.tasks import Rendezvous\nfrom jaxswarm.types import pytree\n"
+        "@pytree\nclass Costly(Rendezvous):\n    price: float = 0.5\njaxswarm.TASKS['costly'] = Costly\n"
+    )
+    (tmp_path / "elsewhere").mkdir()
+
+    def run(name, *words, cwd=tmp_path):
+        command = [sys.executable, "-c", f"import sys; from jaxswarm.cli.{name} import main; sys.exit(main())", *words]
+        subprocess.run(command, check=True, cwd=cwd, capture_output=True)
+
+    run("train", "imports=mine.py", "task=costly", *TINY, "num_updates=1", "run_dir=run")
+    run("train", "resume=../run", "num_updates=2", cwd=tmp_path / "elsewhere")
+    run("evaluate", "../run", "price=0.1,0.2", cwd=tmp_path / "elsewhere")
+    run("plot", "../run", "out=curve.png", cwd=tmp_path / "elsewhere")
+    assert {"replay.html", "metrics.csv"} < {path.name for path in (tmp_path / "run").iterdir()}
+    (evaluated,) = (tmp_path / "run").glob("eval-*.json")
+    assert [x["task"]["price"] for x in json.loads(evaluated.read_text())["results"]] == [0.1, 0.2]

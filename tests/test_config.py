@@ -1,7 +1,9 @@
 import dataclasses
+from unittest import mock
 
 import pytest
 
+from jaxswarm import AGGREGATORS, TASKS
 from jaxswarm import config as configs
 from jaxswarm.config import ConfigError
 
@@ -167,3 +169,76 @@ def test_heads_have_to_share_the_width():
     for encoder in ("[65]", "[8] network.shared_encoder=[65]"):
         with pytest.raises(ConfigError, match="num_heads = 2 is not possible; accepted: divisors of 65 features"):
             configs.build(configs.compose([*words, *f"network.encoder={encoder}".split()]))
+
+
+OWN = """
+import jaxswarm
+from jaxswarm.aggregators.monoids import Mean
+from jaxswarm.tasks import Rendezvous
+from jaxswarm.types import pytree
+
+@pytree
+class Costly(Rendezvous):
+    price: float = 0.5
+
+class Average(Mean):
+    pass
+
+jaxswarm.TASKS["costly"] = Costly
+jaxswarm.AGGREGATORS["average"] = Average
+"""
+
+
+@pytest.fixture
+def registries(monkeypatch):
+    """What is registered in a test is forgotten after it."""
+    monkeypatch.setattr(configs, "_imported", set())
+    with mock.patch.dict(TASKS), mock.patch.dict(AGGREGATORS):
+        yield
+
+
+def test_files_of_a_user_register_choices(registries, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    words = ["imports=mine.py", "experiment=rendezvous_thesis", "task=costly", "aggregator=average", "price=2"]
+    config = configs.compose([*words, "num_agents=5"])
+    experiment = configs.build(config)
+    assert (type(experiment.task).__name__, experiment.task.price, experiment.task.num_agents) == ("Costly", 2.0, 5)
+    assert type(experiment.network.aggregator).__name__ == "Average"
+    assert experiment.num_worlds == 10
+    assert config["imports"] == [str(tmp_path / "mine.py")]
+    assert "costly" in configs.choices()["task"]
+    with pytest.raises(ConfigError, match=r"did you mean 'task.price'"):
+        configs.compose(["imports=mine.py", "task=costly", "task.prize=2"])
+
+
+def test_a_run_brings_its_imports(registries, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(OWN)
+    config = configs.compose([f"imports=[{tmp_path / 'mine.py'}]", "task=costly"])
+    (tmp_path / "config.yaml").write_text(configs.dump(config))
+    TASKS.pop("costly")
+    monkeypatch.setattr(configs, "_imported", set())
+    assert configs.load(tmp_path / "config.yaml") == config
+    assert configs.build(config).task.price == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "part"), [(None, "FileNotFoundError"), ("1 / 0", "ZeroDivisionError"), ("def", "SyntaxError")]
+)
+def test_an_import_that_fails_is_named(registries, tmp_path, text, part):
+    path = tmp_path / "mine.py"
+    if text:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=f"cannot import {path}: {part}"):
+        configs.compose([f"imports={path}"])
+
+
+def test_what_aggregators_cannot_share_is_said_before_training():
+    words = ["task=pursuit", "aggregator=concat", "network.latent_space=shared"]
+    with pytest.raises(ConfigError, match=r"latent_space = 'shared' is not possible for evaders, neighbors"):
+        configs.build(configs.compose(words))
+
+
+def test_imports_are_names():
+    with pytest.raises(ConfigError, match="imports = 3 is not possible"):
+        configs.compose(["imports=3"])

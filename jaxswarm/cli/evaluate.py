@@ -77,7 +77,7 @@ def _evaluate(
 
     results = []
     for pairs, task, with_leaves in zip(changes, tasks, built, strict=True):
-        of_seeds = {name: np.float64(x) for name, x in play(policies.params, with_leaves).items()}
+        of_seeds = {name: np.asarray(x, np.float64) for name, x in play(policies.params, with_leaves).items()}
         means = {name: _mean(x) for name, x in of_seeds.items()}
         each = {name: [_number(x) for x in values.tolist()] for name, values in of_seeds.items()}
         results.append({"changed": dict(pairs), "task": task, "metrics": means, "of_each_seed": each})

@@ -27,6 +27,7 @@ from jaxswarm.config import Config, ConfigError
 HELP = """\
 jaxswarm-train [group=choice | key=value] ... [run_dir=PATH]
 jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
+jaxswarm-train [group=choice] ... --help
 
 Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, replay.html, checkpoints.
 Ctrl-C or SIGTERM ends it after a checkpoint; resume=PATH continues it exactly where its last checkpoint stands.
@@ -46,7 +47,7 @@ examples
 def main(arguments: Sequence[str]) -> int:
     """Trains, or continues a run; returns the exit code."""
     if wants_help(arguments):
-        print(HELP + "\n" + _keys_help())
+        print(HELP + "\n" + _keys_help([word for word in arguments if "=" in word]))
         return 0
     if join_processes():
         return _train(arguments, is_first=True)
@@ -138,19 +139,35 @@ def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
     return f"{median:.2f}" if len(returns) == 1 else f"{median:.2f} [{low:.2f}, {high:.2f}] over {len(returns)} seeds"
 
 
-def _keys_help() -> str:
-    """Groups with the first comment of each file, and the other keys as the main file documents them."""
-    lines = ["groups (* default)"]
+def _keys_help(words: Sequence[str]) -> str:
+    """Groups with the first comment of each file, and keys as the files document them, those of the chosen groups."""
+    lines, chosen = ["groups (* default)"], dict(configs.parse(words))
     main = (configs.config_dir() / "train.yaml").read_text()
     for group, names in configs.choices().items():
         for name in names:
             text = (configs.config_dir() / group / f"{name}.yaml").read_text()
             comments = (line[2:] for line in text.splitlines() if line.startswith("# ") and not line.startswith("# @"))
-            mark = "*" if f"- {group}: {name}\n" in main else " "
-            lines.append(f"  {mark} {f'{group}={name}':<30} {next(comments, '')}")
+            is_default = f"- {group}: {name}\n" in main
+            if is_default:
+                chosen.setdefault(group, name)
+            lines.append(f"  {'*' if is_default else ' '} {f'{group}={name}':<30} {next(comments, '')}")
     keys = main[main.index("_self_") :].split("\n", 2)[2].strip().splitlines()
-    lines += ["", "keys (and those of each group, as task.num_agents=50)"]
-    return "\n".join(lines + [f"  {line}" for line in keys])
+    lines += ["", "keys", *[f"  {line}" for line in keys]]
+    for part in configs.PARTS:
+        fields = _documented(part, chosen[part]) if chosen[part] in configs.choices()[part] else {}
+        if fields:
+            lines += ["", f"keys of {part}={chosen[part]}", *[f"  {part}.{line}" for line in fields.values()]]
+    return "\n".join(lines)
+
+
+def _documented(part: str, choice: str) -> dict[str, str]:
+    """The lines of a group's file by key, and of those that it builds on."""
+    path = configs.config_dir() / part / f"{choice}.yaml"
+    lines = {}
+    for default in configs.read(path).get("defaults", []):
+        lines |= _documented(part, default)
+    of_keys = [line for line in path.read_text().splitlines() if line.partition(": ")[0].isidentifier()]
+    return lines | {line.partition(":")[0]: line for line in of_keys if not line.startswith("name:")}
 
 
 def _default_run_dir(config: Config) -> str:

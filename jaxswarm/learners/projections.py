@@ -5,8 +5,9 @@ policy's. Every row is projected by itself, and rows within a bound come back bi
 and sums over the action's dimensions, to be compiled, batched and differentiated; old policy and bounds are constants.
 
 Bounds of different kinds are different sizes: near the old policy, a bound of 0.03 lets the mean move by 0.24 old
-standard deviations with `kl`, by 0.17 with the others. The covariance's parts of `kl` and `wasserstein` are equal near
-the old policy; that of `frobenius` is 4 old_std^4 times as large, so it binds tightly or not at all.
+standard deviations with `kl`, by 0.17 with the others (by 0.17 itself with `_unscaled`). The covariance's parts of `kl`
+and `wasserstein` are equal near the old policy; that of `frobenius` is 4 old_std^4 times as large, so it binds tightly
+or not at all.
 """
 
 import dataclasses

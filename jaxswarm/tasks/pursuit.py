@@ -57,7 +57,7 @@ class View(swarm.View):
 
 @pytree
 class Pursuit:
-    """The pursuits of the thesis (sections 5.2.3 and 5.2.4).
+    """The pursuits of the thesis (sections 5.2.2 and 5.2.3).
 
     With `reward="distance"` it is the distance of the pursuer that is nearest to an evader, and an evader caught (at 1
     unit) ends the episode. With `"catches"` every evader caught (at 2 units) gives 1 and starts anew somewhere else.

@@ -46,7 +46,7 @@ class Agents:
 
 @pytree
 class Rendezvous:
-    """The rendezvous of the thesis (section 5.2.2); its figures used the defaults, but "thesis" relative velocities.
+    """The rendezvous of the thesis (section 5.2.1); its figures used the defaults, but "thesis" relative velocities.
 
     With `active_agents` the number of agents of each episode is drawn between these two; `num_agents` is then the most
     there can be. With `max_neighbors` agents perceive their nearest neighbours only, in O(num_agents) memory (see
