@@ -8,6 +8,7 @@ with epy.lazy_api_imports(globals()):  # the command line answers before JAX is 
     from jaxswarm.aggregators import AGGREGATORS
     from jaxswarm.learners import LEARNERS
     from jaxswarm.networks import ActorCritic
+    from jaxswarm.policies import load
     from jaxswarm.tasks import TASKS
     from jaxswarm.training import Experiment, TrainState, evaluate, init, train
 
@@ -22,6 +23,7 @@ __all__ = [
     "TrainState",
     "evaluate",
     "init",
+    "load",
     "make",
     "train",
 ]

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxswarm import checkpoint, reporting, rollout
+import jaxswarm
+from jaxswarm import checkpoint, policies, reporting, rollout
 from jaxswarm import config as configs
 from jaxswarm.cli import evaluate, train
 from jaxswarm.fit import abstract_state
@@ -160,6 +161,24 @@ def test_a_policy_is_evaluated_in_swarms_of_several_sizes(finished, capsys):
     assert table["task.torus"] == ["True", "False", "True", "False"]
     assert table["return"] == [f"{result['metrics']['return']:.4f}" for result in results]
     assert len(set(table["return"])) == 4
+
+
+def test_a_policy_is_loaded(finished, tmp_path):
+    experiment, params = jaxswarm.load(finished, which="last")
+    state = checkpoint.restore(finished / "checkpoints", abstract_state(experiment)).train_state
+    for found, expected in zip(jax.tree.leaves(params), jax.tree.leaves(state.learner.params), strict=True):
+        np.testing.assert_array_equal(found, expected[0])
+    obs = experiment.task.observe(experiment.task.reset(jax.random.key(0)))
+    assert experiment.network.apply(params, obs, method="policy").mean().shape == (3, 2)
+    with pytest.raises(configs.ConfigError, match="seed = 7 is not possible; accepted: 5 to 5"):
+        jaxswarm.load(finished, seed=7)
+    with pytest.raises(configs.ConfigError, match="cannot read"):
+        jaxswarm.load(tmp_path)
+
+
+def test_a_policy_outlives_the_rest_of_its_training_state(finished):
+    config = configs.override(configs.load(finished / "config.yaml"), [("num_worlds", 4), ("total_agent_steps", 480)])
+    assert policies.read(finished, config, "best", [5]).params is not None  # its checkpoint has two worlds
 
 
 def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch):

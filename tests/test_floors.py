@@ -27,7 +27,7 @@ FLOORS = [
     {"config", "checkpoint", "curves", "ensemble"},
     {"plots", "claims"},
     {"reporting"},
-    {"runs", "loggers", "render.film"},
+    {"runs", "loggers", "policies", "render.film"},
     {"recording", "render.page", "render.pictures"},
     {"fit", "render"},
     {"sweep", "search"},

@@ -70,7 +70,7 @@ def _evaluate(
     @jax.jit
     def play(params: Any, task: Any) -> dict[str, Any]:
         def episodes(params: Any) -> dict[str, Any]:
-            policy: Any = functools.partial(policies.network.apply, params, method="policy")
+            policy: Any = functools.partial(policies.experiment.network.apply, params, method="policy")
             return rollout.evaluate(key, task, policy, asked["episodes"])
 
         return jax.lax.map(episodes, params)

@@ -76,4 +76,4 @@ def _film(
 
     title = f"{run_dir.name}, {render.describe(task)}, after update {policies.update}"
     params, limit = render.of_seed(policies.params, 0), render.MAX_SHARES // num_films
-    return render.record(task, policies.network, params, seed=seed, title=title, max_shares=limit)
+    return render.record(task, policies.experiment.network, params, seed=seed, title=title, max_shares=limit)
