@@ -19,6 +19,8 @@ from jaxswarm.networks import ActorCritic
 from jaxswarm.rollout import PolicyFn, Worlds
 from jaxswarm.types import Key, Metrics, is_whole, pytree, require, static
 
+MAX_SAMPLES = 2**31 - 1  # of one update: int32 numbers them
+
 
 @pytree
 class Experiment:
@@ -44,6 +46,11 @@ class Experiment:
         sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every")
         require(self, "whole numbers from 1", is_whole(1), *sizes)
         require(self, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "reset_pool")
+        if self.agent_steps_per_update > MAX_SAMPLES:
+            raise ValueError(
+                f"num_worlds * num_steps * num_agents = {self.agent_steps_per_update} is not possible; "
+                f"accepted: up to {MAX_SAMPLES}"
+            )
         if isinstance(self.learner, OnPolicy):
             batch_size(self.learner, self.agent_steps_per_update, self.task.num_agents)  # raises if it cannot be
 

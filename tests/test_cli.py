@@ -15,7 +15,7 @@ import pytest
 import jaxswarm
 from jaxswarm import checkpoint, policies, reporting, rollout
 from jaxswarm import config as configs
-from jaxswarm.cli import evaluate, train
+from jaxswarm.cli import evaluate, train, words
 from jaxswarm.fit import abstract_state
 
 TINY = [
@@ -123,6 +123,33 @@ def test_a_reader_that_goes_away_is_no_mistake():
     ended = subprocess.run(run, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")
+
+
+@pytest.mark.parametrize(
+    ("error", "part"),
+    [
+        (PermissionError(13, "Permission denied", "runs/x"), "Permission denied: 'runs/x'"),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"), "error: out of memory; smaller"),
+    ],
+)
+def test_what_machines_refuse_is_one_line(error, part, capsys):
+    @words.program
+    def main(arguments):
+        raise error
+
+    assert main([]) == 1
+    err = capsys.readouterr().err
+    assert part in err
+    assert err.count("\n") == 1
+
+
+def test_other_errors_are_not_hidden():
+    @words.program
+    def main(arguments):
+        raise RuntimeError("a mistake in the program")
+
+    with pytest.raises(RuntimeError, match="mistake"):
+        main([])
 
 
 def test_help_shows_groups_choices_and_keys(capsys):

@@ -131,6 +131,13 @@ def test_impossible_sizes_are_named(changes, message):
         EXPERIMENT.replace(**changes)
 
 
+def test_more_samples_than_can_be_numbered_are_an_error():
+    with pytest.raises(
+        ValueError, match=r"num_worlds \* num_steps \* num_agents = \d+ is not possible; accepted: up to"
+    ):
+        EXPERIMENT.replace(num_worlds=2**20, num_steps=2**20)
+
+
 def test_every_episode_of_an_update_has_a_start_of_its_own():
     assert [EXPERIMENT.replace(num_steps=n, num_worlds=12 // n).num_start_states for n in (4, 6, 12)] == [1, 1, 2]
     assert EXPERIMENT.replace(reset_pool=5).num_start_states == 5

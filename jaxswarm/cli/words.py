@@ -35,6 +35,15 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
         except BrokenPipeError:  # whoever read the output has gone, as after `| head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
             return 141
+        except OSError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+        except RuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            hint = "smaller num_worlds, num_steps, num_seeds, eval_worlds or learner.batch_size need less"
+            print(f"error: out of memory; {hint} ({str(error).splitlines()[0]})", file=sys.stderr)
+            return 1
 
     return program
 

@@ -5,6 +5,7 @@ Every agent's step is a sample of its own, with the common reward and that agent
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, TypeVar
@@ -74,7 +75,9 @@ def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
 def nearest_batch_sizes(learner: OnPolicy, num_samples: int, num_agents: int) -> list[int]:
     """All that are possible, the one nearest to the learner's or to the usual one first."""
     unit = _unit(learner, num_agents)
-    possible = [n for n in range(unit, num_samples + 1, unit) if num_samples % n == 0 and n > 1]
+    num_units = num_samples // unit
+    small = [n for n in range(1, math.isqrt(num_units) + 1) if num_units % n == 0]
+    possible = [unit * n for n in sorted({*small, *(num_units // n for n in small)}) if unit * n > 1]
     return sorted(possible, key=lambda n: abs(n - (learner.batch_size or USUAL_BATCH_SIZE)))
 
 
