@@ -12,6 +12,7 @@ from probes import PROBES
 
 from jaxswarm import AGGREGATORS, LEARNERS, TASKS, ActorCritic, rollout
 from jaxswarm.learners import on_policy
+from jaxswarm.types import Observation, pytree, static
 
 
 def advantages_by_definition(reward, is_terminal, is_done, value, next_value, discount, gae_lambda):
@@ -42,6 +43,40 @@ def test_advantages_are_sums_of_temporal_differences(seed, discount, gae_lambda)
 
 
 ADVANTAGES = jax.jit(on_policy.generalized_advantages)
+
+
+def test_for_an_agent_that_dies_its_last_step_is_the_end():
+    rng = np.random.default_rng(1)
+    reward, never = rng.normal(size=(6, 1)).astype(np.float32), np.zeros((6, 1), bool)
+    value, next_value = rng.normal(size=(2, 6, 1, 2)).astype(np.float32)
+    is_gone = np.zeros((6, 1, 2), bool)
+    is_gone[2:, :, 1] = True  # the second agent dies in the third step
+    found = ADVANTAGES(reward, never, never, value, next_value, 0.9, 0.8, is_gone)
+    is_over = np.arange(6) == 2
+    parts = (reward[:, 0], never[:, 0], never[:, 0], value[:, 0, 0], next_value[:, 0, 0])
+    np.testing.assert_allclose(found[:, 0, 0], advantages_by_definition(*parts, 0.9, 0.8), atol=1e-5)
+    parts = (reward[:, 0], is_over, is_over, value[:, 0, 1], next_value[:, 0, 1])
+    np.testing.assert_allclose(found[:3, 0, 1], advantages_by_definition(*parts, 0.9, 0.8)[:3], atol=1e-5)
+
+
+@pytree
+class Dying:
+    """As many agents as there are steps left, of four."""
+
+    num_agents: int = static(default=4)
+
+    def observe(self, state):
+        mask = jnp.arange(self.num_agents) < self.num_agents - state
+        return Observation(jnp.zeros((self.num_agents, 1)), {}, mask)
+
+
+def test_agents_are_gone_after_the_step_in_which_they_die():
+    time = jnp.arange(3)[:, None]
+    trajectory = random_trajectory(PROBES["delayed reward"])[2]
+    trajectory = trajectory.replace(final_state=time + 1, reward=jnp.zeros((3, 1)), mask=jnp.ones((3, 1, 4), bool))
+    gone = on_policy.gone_after(Dying(), trajectory)
+    np.testing.assert_array_equal(gone[:, 0].sum(-1), [1, 2, 3])
+    assert not on_policy.gone_after(Dying(), trajectory.replace(mask=None)).any()
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 7), (4, 1), (2, 8), (164, 1000), (3, 5), (100, 1), (50, 3)])

@@ -142,7 +142,14 @@ def update(
     is_done = trajectory.terminated | trajectory.truncated
     is_terminal = trajectory.terminated if learner.bootstrap_truncation else is_done
     advantage = generalized_advantages(
-        trajectory.reward, is_terminal, is_done, value, next_value, learner.discount, learner.gae_lambda
+        trajectory.reward,
+        is_terminal,
+        is_done,
+        value,
+        next_value,
+        learner.discount,
+        learner.gae_lambda,
+        gone_after(task, trajectory),
     )
     target = advantage + value
     samples = stored_samples(task, trajectory, advantage, target)
@@ -179,6 +186,13 @@ def trajectory_values(
     return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0)))
 
 
+def gone_after(task: Any, trajectory: Trajectory) -> Bool[Array, "steps worlds #agents"]:
+    """Agents that do not exist after each step, before any reset."""
+    if trajectory.mask is None:
+        return jnp.zeros((*trajectory.reward.shape, 1), bool)
+    return ~jax.vmap(jax.vmap(task.observe))(trajectory.final_state).mask
+
+
 def generalized_advantages(
     reward: Float[Array, "steps worlds"],
     is_terminal: Bool[Array, "steps worlds"],
@@ -187,13 +201,15 @@ def generalized_advantages(
     next_value: Float[Array, "steps worlds agents"],
     discount: Float[Array, ""] | float,
     gae_lambda: Float[Array, ""] | float,
+    is_gone: Bool[Array, "steps worlds #agents"] | bool = False,
 ) -> Float[Array, "steps worlds agents"]:
     """Generalised advantage estimates (Schulman et al., 2016).
 
     `is_terminal` steps have no value after them; `is_done` steps end an episode, so nothing flows back across them.
+    For agents that do not exist after a step, `is_gone`, it is both.
     """
-    delta = reward[..., None] + discount * jnp.where(is_terminal[..., None], 0.0, next_value) - value
-    decay = discount * gae_lambda * (1.0 - is_done[..., None])
+    delta = reward[..., None] + discount * jnp.where(is_terminal[..., None] | is_gone, 0.0, next_value) - value
+    decay = discount * gae_lambda * (1.0 - (is_done[..., None] | is_gone))
 
     def backwards(advantage: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         delta, decay = step
