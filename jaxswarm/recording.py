@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import math
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from jaxswarm.config import ConfigError
 from jaxswarm.loggers import LOGGERS, Logger
 from jaxswarm.reporting import RETURN, Row
 from jaxswarm.training import Experiment, TrainState, is_loss
+
+SECONDS_PER_CURVE = 60.0  # from one picture of the curve during training to the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +79,7 @@ class Recorder:
         self._loggers: dict[int, list[Logger]] = {}
         self._last: _Candidate | None = None
         self._best: _Candidate | None = None  # better than all on disk, and not yet there
+        self._last_drawn = time.monotonic()
 
     def open(self, num_updates: int) -> None:
         """Prepares the run folder; called once the device is at work."""
@@ -187,6 +191,9 @@ class Recorder:
             for logger in self._loggers.get(seed, []):
                 logger.log(self.rows[-1])
         self._since_evaluation = {name: [] for name in self._since_evaluation}
+        if self.run.run_dir and self.rows and time.monotonic() - self._last_drawn >= SECONDS_PER_CURVE:
+            draw_curve(self.run, self.rows)
+            self._last_drawn = time.monotonic()
 
     def _consider(self, candidate: _Candidate) -> None:
         """Remembers the states as the last ones, and as the best ones if they are."""

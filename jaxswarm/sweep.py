@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxswarm import config as configs
+from jaxswarm import render
 from jaxswarm import runs as folders
 from jaxswarm.checkpoint import replace_text
 from jaxswarm.config import Config, ConfigError
@@ -43,7 +44,9 @@ class Trial:
 
     def run(self) -> Run:
         """What `fit_runs` takes."""
-        return Run(self.experiment, self.settings.seeds, self.run_dir, self.settings.loggers, self.config)
+        render_every = self.settings.render_every
+        show = render.hook(self.run_dir, self.experiment, render_every) if render_every else None
+        return Run(self.experiment, self.settings.seeds, self.run_dir, self.settings.loggers, self.config, show)
 
 
 def expand(words: Sequence[str]) -> list[Config]:

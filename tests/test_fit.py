@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import checkpoint, config, reporting
+from jaxswarm import checkpoint, config, recording, reporting
 from jaxswarm import fit as fitting
 from jaxswarm.config import ConfigError
 from jaxswarm.fit import DivergedError, fit
@@ -192,6 +192,19 @@ def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkp
         fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)
     restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(restored.train_state.learner.params))
+
+
+def test_the_curve_grows_during_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "SECONDS_PER_CURVE", 0.0)
+    curve, sizes = tmp_path / "run" / "curve.png", []
+    fit(
+        EXPERIMENT,
+        NUM_UPDATES,
+        run_dir=tmp_path / "run",
+        on_evaluation=lambda *_: sizes.append(curve.stat().st_size),
+        **OPTIONS,
+    )
+    assert len(set(sizes)) == 3
 
 
 @pytree

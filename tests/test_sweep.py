@@ -16,7 +16,7 @@ from jaxswarm.config import ConfigError
 from jaxswarm.learners.on_policy import batch_size
 
 WORDS = [*TINY, "num_updates=4", "num_seeds=2"]
-SWEPT = [*WORDS, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu"]
+SWEPT = [*WORDS, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu", "render_every=1"]
 
 
 @pytest.mark.parametrize(
@@ -81,6 +81,7 @@ def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, 
     for folder in folders:
         rows = reporting.read_rows(folder / "metrics.csv")
         assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 4) for s in (5, 6)]
+        assert {path.name for path in folder.glob("replay-*.html")} == {"replay-0.html", "replay-3.html"}
     alone = config.load(folders[3] / "config.yaml")
     _, expected = fit.fit(config.build(alone), 4, seed=6, progress=False)
     found = [row["eval/return"] for row in reporting.read_rows(folders[3] / "metrics.csv") if row["seed"] == 6]
