@@ -160,6 +160,7 @@ def test_run_settings_are_the_keys_beside_the_experiment():
         "keep_checkpoints": 3,
         "render_every": None,
         "loggers": (),
+        "imports": (),
     }
 
 
