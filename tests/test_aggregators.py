@@ -190,7 +190,8 @@ def test_order_has_no_influence(name, seed):
     (_, one_gradient), one = EVALUATE[name](params_of(name), flat(messages), regular)
     (_, two_gradient), two = EVALUATE[name](params_of(name), flat(messages)[order], shuffled)
     np.testing.assert_allclose(two, one, atol=2e-6, rtol=1e-5)
-    np.testing.assert_allclose(two_gradient, one_gradient[order], atol=2e-5, rtol=1e-4)
+    rounding = 4e-6 * np.abs(one_gradient).max()  # of large parts of a gradient that cancel
+    np.testing.assert_allclose(two_gradient, one_gradient[order], atol=2e-5 + rounding, rtol=1e-4)
 
 
 @every_aggregator

@@ -234,6 +234,7 @@ def test_an_import_that_fails_is_named(registries, tmp_path, text, part):
         configs.compose([f"imports={path}"])
 
 
+@pytest.mark.slow
 def test_what_aggregators_cannot_share_is_said_before_training():
     words = ["task=pursuit", "aggregator=concat", "network.latent_space=shared"]
     with pytest.raises(ConfigError, match=r"latent_space = 'shared' is not possible for evaders, neighbors"):

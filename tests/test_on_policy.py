@@ -70,6 +70,7 @@ class Dying:
         return Observation(jnp.zeros((self.num_agents, 1)), {}, mask)
 
 
+@pytest.mark.slow
 def test_agents_are_gone_after_the_step_in_which_they_die():
     time = jnp.arange(3)[:, None]
     trajectory = random_trajectory(PROBES["delayed reward"])[2]
