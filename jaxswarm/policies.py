@@ -10,7 +10,8 @@ import numpy as np
 from jaxswarm import config as configs
 from jaxswarm.checkpoint import restore
 from jaxswarm.config import Config, ConfigError
-from jaxswarm.training import Experiment, init
+from jaxswarm.fit import abstract_state
+from jaxswarm.training import Experiment
 
 
 class Policies(NamedTuple):
@@ -52,9 +53,8 @@ def read(
     missing = [seed for seed in seeds if seed not in trained]
     if missing:
         raise ConfigError(f"seed = {missing[0]} is not possible; accepted: {trained[0]} to {trained[-1]}")
-    shapes = jax.eval_shape(init, experiment, jax.random.key(0)).learner.params
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct((len(trained), *x.shape), x.dtype), shapes)
-    restored = restore(run_dir / "checkpoints", {"learner": {"params": shapes}}, which, warn)
+    template = {"learner": {"params": abstract_state(experiment, len(trained)).learner.params}}
+    restored = restore(run_dir / "checkpoints", template, which, warn)
     if restored is None:
         raise ConfigError(f"{run_dir} has no checkpoint yet; continue it with: jaxswarm-train resume={run_dir}")
     wanted = np.array([trained.index(seed) for seed in seeds])
