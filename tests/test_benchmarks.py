@@ -33,6 +33,7 @@ def test_all_benchmarks_are_run_here():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 @pytest.mark.parametrize("name", sorted(WORDS))
 def test_benchmark_prints_possible_figures(name):
     if name == "box_physics" and not importlib.util.find_spec("Box2D"):

@@ -25,17 +25,7 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """A compile cache for this module."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-        yield
-    jax.config.update("jax_compilation_cache_dir", None)
-
-
-@pytest.fixture(scope="module")
-def finished(cache, tmp_path_factory):
+def finished(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("runs") / "finished"
     assert train.main([*TINY, "num_updates=4", f"run_dir={run_dir}"]) == 0
     return run_dir
@@ -264,12 +254,12 @@ def wait_for_rows(process, run_dir, num_rows):
 
 
 @pytest.mark.slow
-def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(cache, tmp_path):
-    words = [*TINY, "num_updates=3000", "checkpoint_seconds=0.05"]
+def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path):
+    words = [*TINY, "num_updates=900", "checkpoint_seconds=0.05"]
     undisturbed, run_dir = tmp_path / "undisturbed", tmp_path / "run"
     assert train.main([*words, f"run_dir={undisturbed}"]) == 0
     process = start(*words, f"run_dir={run_dir}")
-    for num_rows, number, code in ((50, signal.SIGKILL, -9), (200, signal.SIGKILL, -9), (400, signal.SIGTERM, 0)):
+    for num_rows, number, code in ((30, signal.SIGKILL, -9), (80, signal.SIGKILL, -9), (130, signal.SIGTERM, 0)):
         wait_for_rows(process, run_dir, num_rows)
         process.send_signal(number)
         out, err = process.communicate(timeout=120)
@@ -285,13 +275,14 @@ def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(cache, tmp_pat
     assert table(run_dir) == table(undisturbed)
     template = abstract_state(configs.build(configs.load(run_dir / "config.yaml")))
     states = [checkpoint.restore(path / "checkpoints", template) for path in (undisturbed, run_dir)]
-    assert [state.update for state in states] == [3000, 3000]
+    assert [state.update for state in states] == [900, 900]
     for a, b in zip(*(jax.tree.leaves(state.train_state.learner) for state in states), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.slow
-def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(cache, tmp_path):
+@pytest.mark.usefixtures("few_optimisations")
+def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(tmp_path):
     (tmp_path / "mine.py").write_text(
         "import jaxswarm\nfrom jaxswarm.tasks import Rendezvous\nfrom jaxswarm.types import pytree\n"
         "@pytree\nclass Costly(Rendezvous):\n    price: float = 0.5\njaxswarm.TASKS['costly'] = Costly\n"

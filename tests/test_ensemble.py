@@ -181,6 +181,7 @@ def test_numbers_of_a_batch_may_be_arrays():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 @pytest.mark.parametrize(("num_runs", "mesh"), [(8, (8, 1)), (2, (2, 4)), (1, (1, 4))])
 def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):
     (tmp_path / "tests_config.py").write_text(CONFIG)
@@ -196,6 +197,7 @@ def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 @pytest.mark.parametrize("num_seeds", [2, 1])
 def test_two_processes_train_together_and_the_first_one_writes(num_seeds, tmp_path):
     with socket.socket() as free:

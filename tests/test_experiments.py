@@ -381,6 +381,7 @@ def test_a_report_is_not_replaced_by_an_empty_one(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
     trained("mine", 0, 2)
     odd = trained("odd", 0, 2, num_worlds=40, num_steps=51)
@@ -416,6 +417,7 @@ def test_wrong_words_are_errors(capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     words = ["fig_6_15", "seeds=2", f"dir={tmp_path}", *TINY]
     real, lengths = sweep.train, []

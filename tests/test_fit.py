@@ -195,6 +195,7 @@ def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkp
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 def test_the_curve_grows_during_training(tmp_path, monkeypatch):
     monkeypatch.setattr(recording, "SECONDS_PER_CURVE", 0.0)
     curve, sizes = tmp_path / "run" / "curve.png", []

@@ -84,6 +84,7 @@ def test_links_between_notebooks_lead_somewhere(name):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 def test_notebooks_run(name, tmp_path, monkeypatch):
     client = pytest.importorskip("nbclient")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")

@@ -190,19 +190,15 @@ def test_what_cannot_be_written_is_said(name, options, part, tmp_path, monkeypat
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory):
     """The folder of a run that has just begun."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-        run_dir = tmp_path_factory.mktemp("runs") / "run"
-        run_dir.mkdir()
-        config = configs.compose(TINY)
-        (run_dir / "config.yaml").write_text(configs.dump(config))
-        checkpoints = Checkpoints(run_dir / "checkpoints")
-        state = init(configs.build(config), jax.random.key(0))
-        checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
-        checkpoints.close()
-        yield run_dir
-    jax.config.update("jax_compilation_cache_dir", None)
+    run_dir = tmp_path_factory.mktemp("runs") / "run"
+    run_dir.mkdir()
+    config = configs.compose(TINY)
+    (run_dir / "config.yaml").write_text(configs.dump(config))
+    checkpoints = Checkpoints(run_dir / "checkpoints")
+    state = init(configs.build(config), jax.random.key(0))
+    checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
+    checkpoints.close()
+    return run_dir
 
 
 def test_a_replay_in_the_run_folder(run_dir):

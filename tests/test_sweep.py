@@ -56,6 +56,7 @@ def test_equal_runs_are_refused(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, capsys):
     sweep_dir, begun = tmp_path / "sweep", []
     real = sweep.fit_runs
@@ -166,6 +167,7 @@ def test_impossible_spaces_are_errors(tmp_path, text, message):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_optimisations")
 def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, monkeypatch, capsys):
     pytest.importorskip("optuna")
     (tmp_path / "space.yaml").write_text(SPACE)
