@@ -254,10 +254,11 @@ def wait_for_rows(process, run_dir, num_rows):
 
 
 @pytest.mark.slow
-def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path):
+def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path, monkeypatch):
     words = [*TINY, "num_updates=900", "checkpoint_seconds=0.05"]
     undisturbed, run_dir = tmp_path / "undisturbed", tmp_path / "run"
     assert train.main([*words, f"run_dir={undisturbed}"]) == 0
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     process = start(*words, f"run_dir={run_dir}")
     for num_rows, number, code in ((30, signal.SIGKILL, -9), (80, signal.SIGKILL, -9), (130, signal.SIGTERM, 0)):
         wait_for_rows(process, run_dir, num_rows)
