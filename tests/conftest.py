@@ -14,8 +14,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 def pytest_configure(config):
     """Keeps what is compiled for other tests, for programs that they start, and for the next time tests are run.
 
-    Compiling is most of what fast tests take, so that they compile with few optimisations. The slow ones, and any test
-    that is run alone, compile as users do.
+    Compiling is most of what fast tests take, so that they compile with few optimisations. The slow ones, and all
+    without `-m "not slow"`, compile as users do.
     """
     home = config.cache.mkdir("xdg")
     os.environ["XDG_CACHE_HOME"] = str(home)
@@ -27,7 +27,7 @@ def pytest_configure(config):
 
 @pytest.fixture
 def few_optimisations(monkeypatch):
-    """For slow tests that ask whether programs run, not what comes out; compiling takes half the time."""
+    """For slow tests that ask whether programs run, or run alike; compiling takes half the time."""
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     jax.config.update("jax_disable_most_optimizations", True)
     yield
