@@ -76,7 +76,7 @@ class Checkpoints:
         options = ocp.CheckpointManagerOptions(
             max_to_keep=None,
             create=False,
-            cleanup_tmp_directories=True,
+            cleanup_tmp_directories=any(self._directory.iterdir()),  # outlives a manager that saves nothing
             enable_async_checkpointing=False,
             multiprocessing_options=_alone(),
         )

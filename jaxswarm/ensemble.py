@@ -27,6 +27,7 @@ from jaxswarm.types import Metrics
 RUNS_AXIS = "runs"
 CPU_WIDTH = 1  # runs side by side on a CPU, whose cache holds the activations of one; measured, see benchmarks/LOG.md
 MEMORY_SHARE = 0.9  # of what is free that a program may take
+LESS_MEMORY = "smaller num_worlds, num_steps, num_seeds, eval_worlds or learner.batch_size need less"
 
 Program = Callable[[Experiment, TrainState, Any], tuple[TrainState, Metrics]]  # the last: how many updates
 
@@ -119,21 +120,25 @@ def _is_key(x: Any) -> bool:
 
 
 def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[str], None]) -> Program:
-    """`train_chunk` of every run, donating the states; as many runs side by side as memory holds."""
+    """`train_chunk` of every run, donating the states; as many runs side by side as memory holds.
+
+    Where memory holds not even one, it says so before anything is computed.
+    """
     num_local = batch.num_runs // (batch.mesh.shape[RUNS_AXIS] if batch.mesh else 1)
     width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
-    while width > 1:
-        with _on(batch):
-            program = _advance.lower(batch.experiments, states, np.int32(0), size, width, batch.mesh).compile()
-        needed, free = _memory(program), _free_memory()
-        if free is None or needed <= free:
-            return program
+    while True:
+        with _on(batch):  # the call below finds what is compiled here
+            needed = _memory(_advance.lower(batch.experiments, states, np.int32(0), size, width, batch.mesh).compile())
+        free = _free_memory()
+        if needed <= free:
+            break
+        sizes = f"{needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free"
+        if width == 1:
+            warn(f"training needs {sizes}; {LESS_MEMORY}")
+            break
         smaller = [n for n in range(1, width) if num_local % n == 0]
         width = max(n for n in smaller if n == 1 or n <= width * free / needed)
-        warn(
-            f"{num_local} runs side by side need {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
-            f"{width} at a time"
-        )
+        warn(f"{num_local} runs side by side need {sizes}: {width} at a time")
 
     def program(experiments: Experiment, states: TrainState, num_updates: Any) -> tuple[TrainState, Metrics]:
         with _on(batch):
@@ -204,15 +209,17 @@ def _spread(mesh: Mesh | None, function: Callable, width: int) -> Callable:
 
 
 def _memory(program: Any) -> int:
-    """Bytes that a device needs to run it."""
+    """Bytes that a device needs to run it; 0 if that is not known."""
     analysis = program.memory_analysis()
+    if analysis is None:
+        return 0
     sizes = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
     return sizes - analysis.alias_size_in_bytes
 
 
-def _free_memory() -> float | None:
-    """Bytes that a program may take on each device; `None` if that is not known."""
+def _free_memory() -> float:
+    """Bytes that a program may take on each device; infinite if that is not known."""
     if jax.default_backend() == "cpu":
         return MEMORY_SHARE * psutil.virtual_memory().available / jax.local_device_count()
     stats = jax.local_devices()[0].memory_stats()
-    return MEMORY_SHARE * (stats["bytes_limit"] - stats["bytes_in_use"]) if stats else None
+    return MEMORY_SHARE * (stats["bytes_limit"] - stats["bytes_in_use"]) if stats else math.inf

@@ -1,4 +1,5 @@
 import shutil
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -117,6 +118,12 @@ def test_a_state_of_another_shape_is_named(written):
 
 def test_where_nothing_was_written_there_is_nothing_to_restore(tmp_path):
     assert checkpoint.restore(tmp_path / "none", TEMPLATE) is None
+
+
+def test_where_nothing_is_written_no_thread_outlives_it(tmp_path):
+    before = set(threading.enumerate())
+    Checkpoints(tmp_path / "new").close()
+    assert set(threading.enumerate()) <= before
 
 
 def test_text_is_replaced_as_a_whole(tmp_path):

@@ -80,15 +80,15 @@ def test_side_by_side_by_vmap_is_the_same_to_rounding(three_seeds, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time(monkeypatch):
+def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time_and_says_if_one_is_too_many(monkeypatch):
     monkeypatch.setattr(ensemble, "CPU_WIDTH", 4)
     monkeypatch.setattr(ensemble, "_free_memory", lambda: 1e3)
     batch, said = ensemble.make_batch([EXPERIMENT], 4), []
     states = ensemble.init_batch(batch, range(4))
     ensemble.compile_batch(batch, states, 3, said.append)
-    assert len(said) == 1
-    assert said[0].startswith("4 runs side by side need")
+    assert [text[:24] for text in said] == ["4 runs side by side need", "training needs 0.0 GiB a"]
     assert said[0].endswith("1 at a time")
+    assert said[1].endswith(ensemble.LESS_MEMORY)
 
 
 @pytest.fixture(scope="module")

@@ -41,8 +41,9 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
         except RuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
-            hint = "smaller num_worlds, num_steps, num_seeds, eval_worlds or learner.batch_size need less"
-            print(f"error: out of memory; {hint} ({str(error).splitlines()[0]})", file=sys.stderr)
+            from jaxswarm.ensemble import LESS_MEMORY  # noqa: PLC0415
+
+            print(f"error: out of memory; {LESS_MEMORY} ({str(error).splitlines()[0]})", file=sys.stderr)
             return 1
 
     return program
