@@ -144,9 +144,14 @@ def set_aside_after(directory: Path, update: int) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Writes a file as a whole: after a crash it has its old content or the new."""
+    replace_bytes(path, text.encode())
+
+
+def replace_bytes(path: Path, content: bytes) -> None:
+    """`replace_text` for what is no text."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "w", encoding="utf-8") as file:
-        file.write(text)
+    with open(temporary, "wb") as file:
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)

@@ -32,3 +32,25 @@ def few_optimisations(monkeypatch):
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="session")
+def run_dir(tmp_path_factory):
+    """The folder of a tiny run that has just begun."""
+    from jaxswarm import config as configs  # noqa: PLC0415
+    from jaxswarm.checkpoint import Checkpoints  # noqa: PLC0415
+    from jaxswarm.training import init  # noqa: PLC0415
+
+    words = (
+        "task.num_agents=3 task.episode_length=5 num_worlds=2 num_steps=4 learner.batch_size=12 eval_worlds=1 "
+        "eval_every=3 network.encoder=[4] network.decoder=[4] num_updates=1"
+    )
+    run_dir = tmp_path_factory.mktemp("runs") / "run"
+    run_dir.mkdir()
+    config = configs.compose(words.split())
+    (run_dir / "config.yaml").write_text(configs.dump(config))
+    checkpoints = Checkpoints(run_dir / "checkpoints")
+    state = init(configs.build(config), jax.random.key(0))
+    checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
+    checkpoints.close()
+    return run_dir

@@ -12,7 +12,7 @@ import jaxswarm
 PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types", "scene", "schema"},
-    {"geometry", "contacts", "sets", "distributions"},
+    {"geometry", "contacts", "sets", "distributions", "export"},
     {"dynamics", "neighbors", "shapes", "aggregators.monoids", "aggregators.attentive"},
     {"rigid2d", "tasks.swarm", "tasks.evasion", "aggregators.features"},
     {"tasks.rendezvous", "tasks.pursuit", "tasks.arena", "aggregators"},
@@ -35,7 +35,7 @@ FLOORS = [
     {"report"},
     {"cli.words"},
     {"cli.policies"},
-    {"cli.train", "cli.evaluate", "cli.plot", "cli.render"},
+    {"cli.train", "cli.evaluate", "cli.plot", "cli.render", "cli.export"},
     {"cli.sweep", "cli.experiment"},
     {"cli"},
 ]

@@ -18,7 +18,6 @@ from PIL import Image
 
 from jaxswarm import config as configs
 from jaxswarm import render
-from jaxswarm.checkpoint import Checkpoints
 from jaxswarm.cli import render as program
 from jaxswarm.distributions import gaussian
 from jaxswarm.render import page
@@ -26,11 +25,6 @@ from jaxswarm.render.film import MAX_SHARES
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.training import init
 from jaxswarm.types import Entities, Observation, Step, pytree, static
-
-TINY = [
-    *("task.num_agents=3", "task.episode_length=5", "num_worlds=2", "num_steps=4", "learner.batch_size=12"),
-    *("eval_worlds=1", "eval_every=3", "network.encoder=[4]", "network.decoder=[4]", "num_updates=1"),
-]
 
 
 @pytree
@@ -185,20 +179,6 @@ def test_what_cannot_be_written_is_said(name, options, part, tmp_path, monkeypat
     with pytest.raises(render.RenderError, match=re.escape(part)):
         render.write(tmp_path / name, [episode()], **options)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.fixture(scope="module")
-def run_dir(tmp_path_factory):
-    """The folder of a run that has just begun."""
-    run_dir = tmp_path_factory.mktemp("runs") / "run"
-    run_dir.mkdir()
-    config = configs.compose(TINY)
-    (run_dir / "config.yaml").write_text(configs.dump(config))
-    checkpoints = Checkpoints(run_dir / "checkpoints")
-    state = init(configs.build(config), jax.random.key(0))
-    checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
-    checkpoints.close()
-    return run_dir
 
 
 def test_a_replay_in_the_run_folder(run_dir):
