@@ -7,17 +7,15 @@ anything is compiled.
 """
 
 import dataclasses
-import importlib.util
 import inspect
 import itertools
 import math
-import sys
 import typing
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jaxswarm import schema
+from jaxswarm import imports, schema
 from jaxswarm.schema import ConfigError
 
 if TYPE_CHECKING:
@@ -90,7 +88,7 @@ def choices() -> dict[str, list[str]]:
 
 def _own(group: str) -> list[str]:
     """Names that files of `imports` have registered."""
-    if group not in REGISTERED or not _imported:
+    if group not in REGISTERED or not imports.have_run:
         return []
     return sorted(name for name, cls in _registries()[group].items() if not cls.__module__.startswith("jaxswarm."))
 
@@ -106,7 +104,7 @@ def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
     from hydra.errors import HydraException  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
 
-    pairs = [(key, _import(value)) if key == "imports" else (key, value) for key, value in pairs]
+    pairs = [(key, imports.run(value)) if key == "imports" else (key, value) for key, value in pairs]
     groups = choices()
     chosen = {
         key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and (key, value) != NO_PRESET
@@ -124,36 +122,8 @@ def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
 def load(path: Path) -> Config:
     """The config of a run, as `dump` wrote it; imports what it was trained with."""
     config = read(path)
-    _import(config.get("imports", []))
+    imports.run(config.get("imports", []))
     return validate(config)
-
-
-_imported: set[str] = set()  # once in a process
-
-
-def _import(places: Any) -> Any:
-    """Runs files or modules that register a user's own tasks, aggregators and learners; returns files as full paths."""
-    places = [places] if isinstance(places, str) else places
-    if not isinstance(places, list) or not all(isinstance(place, str) for place in places):
-        return places  # which `validate` says
-    full = [str(Path(place).resolve()) if place.endswith(".py") else place for place in places]
-    for place in full:
-        if place not in _imported:
-            try:
-                _import_file(place) if place.endswith(".py") else importlib.import_module(place)
-            except Exception as error:  # whatever a user's file leads to
-                raise ConfigError(f"cannot import {place}: {type(error).__name__}: {error}") from error
-            _imported.add(place)
-    return full
-
-
-def _import_file(path: str) -> None:
-    name = f"imported_{len(_imported)}_{Path(path).stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    sys.modules[name] = importlib.util.module_from_spec(spec)  # where annotations are looked up
-    spec.loader.exec_module(sys.modules[name])
 
 
 def read(path: Path) -> Config:
@@ -274,6 +244,45 @@ def build(config: Config) -> "Experiment":
         raise
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
+
+
+def describe(experiment: "Experiment", **settings: Any) -> Config | None:
+    """The config that `build` makes this experiment of, with these fields of `Run`; `None` if there is none.
+
+    There is none if a part is of no registered class, or of one from a notebook or a script, which are no `imports`.
+    """
+    import jax  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
+
+    network = experiment.network
+    parts = {"task": experiment.task, "aggregator": network.aggregator, "learner": experiment.learner}
+    try:
+        names = {part: {"name": _registered_name(part, type(owner))} for part, owner in parts.items()}
+        config: Config = {
+            part: names.get(part, {}) | _plain(owner, _fields(part, names.get(part, {})))
+            for part, owner in (parts | {"network": network}).items()
+        }
+        places = [place for owner in parts.values() if (place := imports.place(type(owner)))]
+        config = validate(config | _plain(experiment, _experiment_fields()) | {"imports": places} | settings)
+        run_settings(config)
+        built = build(config)
+    except ConfigError:
+        return None
+    same = [np.array_equal(x, y) for x, y in zip(*map(jax.tree.leaves, (built, experiment)), strict=True)]
+    return config if jax.tree.structure(built) == jax.tree.structure(experiment) and all(same) else None
+
+
+def _registered_name(part: str, cls: type) -> str:
+    for name, registered in _registries()[part].items():
+        if registered is cls:
+            return name
+    raise ConfigError(f"{cls.__name__} is not registered; accepted: {', '.join(_registries()[part])}")
+
+
+def _plain(owner: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Fields as YAML has them: numbers of JAX and NumPy as those of Python."""
+    values = {name: getattr(owner, name) for name in names if name != "name"}
+    return {name: x.item() if hasattr(x, "item") and x.ndim == 0 else x for name, x in values.items()}
 
 
 def build_part(part: str, config: Config) -> Any:

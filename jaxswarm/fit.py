@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxswarm import config as configs
 from jaxswarm import ensemble, loggers, reporting
-from jaxswarm.checkpoint import Restored, restore, set_aside_after
+from jaxswarm.checkpoint import Restored, replace_text, restore, set_aside_after
 from jaxswarm.ensemble import Batch
 from jaxswarm.recording import Recorder, Run, draw_curve, locked
 from jaxswarm.reporting import Row
@@ -68,15 +69,19 @@ def fit(
     row before. With `num_seeds` the seeds from `seed` on are trained side by side: the state has a leading axis, and
     there is a row for each. A seed whose numbers stop being finite stays as it was before.
 
-    `log_to` are names in `loggers.LOGGERS`, to which `config` is shown; `on_evaluation` is called with the update and
-    the parameters [seeds, ...] of each evaluated policy but the last.
+    `log_to` are names in `loggers.LOGGERS`; `on_evaluation` is called with the update and the parameters [seeds, ...]
+    of each evaluated policy but the last.
 
-    With `run_dir` the folder gets `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and
-    the best, at most every `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last
+    With `run_dir` the folder gets `config.yaml` (`config`, by default what `config.describe` says, if anything),
+    `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, at most every
+    `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last
     checkpoint. Raises `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints
     but none can be restored, and `FileExistsError` for a folder with another run in it.
     """
     seeds = tuple(range(seed, seed + (num_seeds or 1)))
+    if config is None and run_dir is not None:
+        kept = {"checkpoint_seconds": checkpoint_seconds, "keep_checkpoints": keep_checkpoints, "loggers": log_to}
+        config = configs.describe(experiment, num_updates=num_updates, seed=seed, num_seeds=len(seeds), **kept)
     run = Run(experiment, seeds, None if run_dir is None else Path(run_dir), log_to, config, on_evaluation)
     states, (rows,) = fit_runs(
         [run],
@@ -132,6 +137,9 @@ def _fit(
         return _joined(restored), [_finished_rows(run) for run in runs]
     batch = ensemble.make_batch([run.experiment for run in runs], len(runs[0].seeds))
     runs = runs if is_first else [Run(run.experiment, run.seeds) for run in runs]
+    for run in runs:
+        if run.run_dir and run.config is not None:
+            replace_text(run.run_dir / "config.yaml", configs.dump(dict(run.config)))
     start = restored[0].update if restored else 0
     agent_steps = runs[0].experiment.agent_steps_per_update * batch.num_runs
     with (

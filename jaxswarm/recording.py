@@ -29,7 +29,7 @@ class Run:
     seeds: tuple[int, ...] = (0,)
     run_dir: Path | None = None
     loggers: tuple[str, ...] = ()  # names in `LOGGERS`, which need a folder
-    config: Mapping[str, Any] | None = None  # what the loggers show of it
+    config: Mapping[str, Any] | None = None  # goes into the folder, and is shown to loggers
     on_evaluation: Callable[[int, Any], None] | None = None  # called with updates done and parameters [seeds, ...]
 
 

@@ -92,9 +92,6 @@ def train(together: Sequence[Trial], progress: bool = True) -> tuple[bool, list[
     Returns whether they are finished, which they are not after Ctrl-C, and their rows. Trials of which all seeds
     diverge are finished.
     """
-    for trial in together:
-        trial.run_dir.mkdir(parents=True, exist_ok=True)
-        replace_text(trial.run_dir / "config.yaml", configs.dump(trial.config))
     settings, num_updates = together[0].settings, together[0].num_updates
     try:
         states, rows = fit_runs(

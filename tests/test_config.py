@@ -1,9 +1,11 @@
 import dataclasses
 from unittest import mock
 
+import jax.numpy as jnp
 import pytest
 
-from jaxswarm import AGGREGATORS, TASKS
+import jaxswarm
+from jaxswarm import AGGREGATORS, TASKS, imports
 from jaxswarm import config as configs
 from jaxswarm.config import ConfigError
 
@@ -193,7 +195,7 @@ jaxswarm.AGGREGATORS["average"] = Average
 @pytest.fixture
 def registries(monkeypatch):
     """What is registered in a test is forgotten after it."""
-    monkeypatch.setattr(configs, "_imported", set())
+    monkeypatch.setattr(imports, "have_run", set())
     with mock.patch.dict(TASKS), mock.patch.dict(AGGREGATORS):
         yield
 
@@ -218,9 +220,47 @@ def test_a_run_brings_its_imports(registries, tmp_path, monkeypatch):
     config = configs.compose([f"imports=[{tmp_path / 'mine.py'}]", "task=costly"])
     (tmp_path / "config.yaml").write_text(configs.dump(config))
     TASKS.pop("costly")
-    monkeypatch.setattr(configs, "_imported", set())
+    monkeypatch.setattr(imports, "have_run", set())
     assert configs.load(tmp_path / "config.yaml") == config
     assert configs.build(config).task.price == 0.5
+
+
+def run_fields(config):
+    return {field.name: config[field.name] for field in dataclasses.fields(configs.Run) if field.name != "imports"}
+
+
+@pytest.mark.parametrize(
+    "word", [f"{group}={choice}" for group, names in configs.choices().items() for choice in names]
+)
+def test_every_experiment_is_described_by_the_config_it_was_made_of(word):
+    config = configs.compose([word, *["batch_size=null"] * word.startswith("learner=")])
+    assert configs.describe(configs.build(config), **run_fields(config)) == config
+
+
+def test_experiments_of_a_user_are_described_with_their_imports(registries, tmp_path):
+    (tmp_path / "mine.py").write_text(OWN)
+    config = configs.compose([f"imports={tmp_path / 'mine.py'}", "task=costly", "price=3"])
+    assert configs.describe(configs.build(config), **run_fields(config)) == config
+
+
+def test_numbers_of_arrays_are_described():
+    experiment = configs.build(configs.compose())
+    learner = experiment.learner.replace(learning_rate=jnp.float32(0.25))
+    config = configs.describe(experiment.replace(learner=learner), num_updates=3)
+    assert (config["learner"]["learning_rate"], config["num_updates"], config["total_agent_steps"]) == (0.25, 3, None)
+
+
+@pytest.mark.parametrize("change", ["class", "fields", "length"])
+def test_what_no_config_can_say_has_no_description(change):
+    experiment, num_updates = configs.build(configs.compose()), 3
+    if change == "class":
+        own = type("Own", (jaxswarm.TASKS["rendezvous"],), {})
+        experiment = experiment.replace(task=own())
+    if change == "fields":
+        experiment = experiment.replace(network=jaxswarm.ActorCritic(action_dim=3))
+    if change == "length":
+        num_updates = 0
+    assert configs.describe(experiment, num_updates=num_updates) is None
 
 
 @pytest.mark.parametrize(

@@ -81,12 +81,29 @@ def test_the_last_row_evaluates_the_final_policy(undisturbed):
 
 def test_the_run_folder_is_complete(undisturbed):
     run_dir = undisturbed[2]
-    assert {path.name for path in run_dir.iterdir()} == {"manifest.json", "metrics.csv", "checkpoints", "curve.png"}
+    names = {"config.yaml", "manifest.json", "metrics.csv", "checkpoints", "curve.png"}
+    assert {path.name for path in run_dir.iterdir()} == names
     seconds = [row["wall_seconds"] for row in reporting.read_rows(run_dir / "metrics.csv")]
     assert seconds == sorted(seconds)
     best = max(undisturbed[1], key=lambda row: row["eval/return"])
     restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT), "best")
     assert (restored.update, np.float32(restored.score)) == (best["update"], np.float32(best["eval/return"]))
+
+
+def test_what_python_trained_is_loaded_like_any_run(undisturbed):
+    state, _, run_dir = undisturbed
+    experiment, params = jaxswarm.load(run_dir, "last", seed=3)
+    assert jax.tree.structure(experiment) == jax.tree.structure(EXPERIMENT)
+    assert_same_state(params, state.learner.params)
+
+
+def test_what_is_not_resumed_keeps_its_config(undisturbed, tmp_path):
+    run_dir = shutil.copytree(undisturbed[2], tmp_path / "run")
+    before = (run_dir / "config.yaml").read_text()
+    other = EXPERIMENT.replace(network=jaxswarm.ActorCritic(encoder=(5,), decoder=(4,)))
+    with pytest.raises(checkpoint.CheckpointError):
+        fit(other, NUM_UPDATES + 1, seed=3, run_dir=run_dir, resume=True, **OPTIONS)
+    assert (run_dir / "config.yaml").read_text() == before
 
 
 def test_two_processes_do_not_train_into_one_folder(tmp_path):

@@ -88,15 +88,9 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     use_compile_cache()
     use_cores(run.num_seeds)
     from jaxswarm import render  # noqa: PLC0415
-    from jaxswarm.checkpoint import CheckpointError, replace_text  # noqa: PLC0415
+    from jaxswarm.checkpoint import CheckpointError  # noqa: PLC0415
     from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
 
-    try:
-        if is_first:
-            run_dir.mkdir(parents=True, exist_ok=True)
-            replace_text(run_dir / "config.yaml", configs.dump(config))
-    except OSError as error:
-        raise ConfigError(f"cannot write to {run_dir}: {error.strerror}") from error
     print(_summary(config, experiment, num_updates, run_dir), flush=True)
     try:
         train_state, rows = fit(
