@@ -14,7 +14,8 @@ jaxswarm-export PATH [out=FILE] [checkpoint=best|last] [train_seed=N] [task.key=
 Writes the policy of a run folder as one file, PATH/policy.jax unless `out` names another: a program from observations
 to means and standard deviations of actions, its parameters inside, that runs wherever JAX does, without jaxswarm. It
 takes any number of agents at a time, be it one robot, and has slots for what agents of this task can perceive; those
-not needed are masked. Of a run with several seeds it is the policy of the first, or of train_seed.
+not needed are masked. Act by the mean, clipped to [-1, 1] as the worlds do. Of a run with several seeds it is the
+policy of the first, or of train_seed.
 
 examples
   jaxswarm-export runs/thesis
