@@ -22,8 +22,8 @@ def export_policy(task: Any, network: Any, params: Any) -> export.Exported:
 
     `own` is [agents, own_dim], `groups` has (features [agents, slots, dim], mask [agents, slots]) by name, as `observe`
     gives them: for any number of agents, be it all of a swarm or one robot, and as many slots as agents of this `task`
-    have. Slots that are not needed are masked, so a task of many agents gives a program for any smaller swarm. Evaluations
-    act by the mean; the worlds clip it to [-1, 1].
+    have. Slots that are not needed are masked, so a task of many agents gives a program for any smaller swarm.
+    Evaluations act by the mean; the worlds clip it to [-1, 1].
     """
     (agents,) = export.symbolic_shape("agents")
     obs = jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
