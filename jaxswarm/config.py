@@ -249,12 +249,17 @@ def build(config: Config) -> "Experiment":
 def describe(experiment: "Experiment", **settings: Any) -> Config | None:
     """The config that `build` makes this experiment of, with these fields of `Run`; `None` if there is none.
 
-    There is none if a part is of no registered class, or of one from a notebook or a script, which are no `imports`.
+    There is none for a network of one's own, nor if another part is of no registered class, or of one from a notebook
+    or a script, which are no `imports`.
     """
     import jax  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
+    from jaxswarm.networks import ActorCritic  # noqa: PLC0415
+
     network = experiment.network
+    if type(network) is not ActorCritic:
+        return None
     parts = {"task": experiment.task, "aggregator": network.aggregator, "learner": experiment.learner}
     try:
         names = {part: {"name": _registered_name(part, type(owner))} for part, owner in parts.items()}
@@ -268,8 +273,10 @@ def describe(experiment: "Experiment", **settings: Any) -> Config | None:
         built = build(config)
     except ConfigError:
         return None
+    if jax.tree.structure(built) != jax.tree.structure(experiment):
+        return None
     same = [np.array_equal(x, y) for x, y in zip(*map(jax.tree.leaves, (built, experiment)), strict=True)]
-    return config if jax.tree.structure(built) == jax.tree.structure(experiment) and all(same) else None
+    return config if all(same) else None
 
 
 def _registered_name(part: str, cls: type) -> str:

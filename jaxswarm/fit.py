@@ -74,9 +74,9 @@ def fit(
 
     With `run_dir` the folder gets `config.yaml` (`config`, by default what `config.describe` says, if anything),
     `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, at most every
-    `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last
-    checkpoint. Raises `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints
-    but none can be restored, and `FileExistsError` for a folder with another run in it.
+    `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last checkpoint. Raises
+    `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints but none can be
+    restored, and `FileExistsError` for a folder with another run in it.
     """
     seeds = tuple(range(seed, seed + (num_seeds or 1)))
     if config is None and run_dir is not None:

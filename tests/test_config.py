@@ -3,6 +3,7 @@ from unittest import mock
 
 import jax.numpy as jnp
 import pytest
+from flax import linen as nn
 
 import jaxswarm
 from jaxswarm import AGGREGATORS, TASKS, imports
@@ -250,12 +251,14 @@ def test_numbers_of_arrays_are_described():
     assert (config["learner"]["learning_rate"], config["num_updates"], config["total_agent_steps"]) == (0.25, 3, None)
 
 
-@pytest.mark.parametrize("change", ["class", "fields", "length"])
+@pytest.mark.parametrize("change", ["class", "network", "fields", "length"])
 def test_what_no_config_can_say_has_no_description(change):
     experiment, num_updates = configs.build(configs.compose()), 3
     if change == "class":
         own = type("Own", (jaxswarm.TASKS["rendezvous"],), {})
         experiment = experiment.replace(task=own())
+    if change == "network":
+        experiment = experiment.replace(network=nn.Dense(3))
     if change == "fields":
         experiment = experiment.replace(network=jaxswarm.ActorCritic(action_dim=3))
     if change == "length":
