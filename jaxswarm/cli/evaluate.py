@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxswarm import config as configs
 from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
-from jaxswarm.cli.words import load, only_of_task, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.words import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
@@ -33,19 +33,18 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    paths = [word for word in arguments if "=" not in word]
-    options, words = split([word for word in arguments if "=" in word], OPTIONS)
+    paths, options, words = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
     which = which_checkpoint(options)
-    config = load(Path(paths[0]))
+    config = load(paths[0])
     episodes = whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
     seed = whole("seed", options.get("seed", 0), 0)
     changes = configs.combinations(words)
     only_of_task(changes[0], config, OPTIONS)
     asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": which_seeds(options, config)}
-    result = _evaluate(Path(paths[0]), config, changes, asked)
-    return _report(Path(paths[0]), result) if result else 1
+    result = _evaluate(paths[0], config, changes, asked)
+    return _report(paths[0], result) if result else 1
 
 
 def _evaluate(

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
-from jaxswarm.cli.words import load, only_of_task, program, split, use_compile_cache, wants_help
+from jaxswarm.cli.policies import policy_on_task
+from jaxswarm.cli.words import load, only_of_task, program, split_paths, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -37,28 +37,25 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    paths = [Path(word) for word in arguments if "=" not in word]
-    options, words = split([word for word in arguments if "=" in word], OPTIONS)
+    paths, options, words = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-export PATH [key=value ...]")
-    config, pairs = load(paths[0]), configs.parse(words)
-    only_of_task(pairs, config, OPTIONS)
-    task = configs.build_part("task", configs.override(config, pairs))
+    pairs = configs.parse(words)
+    only_of_task(pairs, load(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "policy.jax"))
-    which, seeds = which_checkpoint(options), which_seeds(options, config)[:1]
     use_compile_cache()
-    policies = load_policies(paths[0], config, which, seeds)
-    if policies is None:
+    found = policy_on_task(paths[0], pairs, options)
+    if found is None:
         return 1
-    require_fit(policies, task)
     import jax  # noqa: PLC0415
 
-    from jaxswarm import checkpoint, export, render  # noqa: PLC0415
+    from jaxswarm import checkpoint, export  # noqa: PLC0415
 
-    exported = export.export_policy(task, policies.experiment.network, render.of_seed(policies.params, 0))
+    task, network, params, update = found
+    exported = export.export_policy(task, network, params)
     out.parent.mkdir(parents=True, exist_ok=True)
     checkpoint.replace_bytes(out, bytes(exported.serialize()))
-    print(f"wrote {out} ({out.stat().st_size / 1e6:.2f} MB), the policy after update {policies.update}")
+    print(f"wrote {out} ({out.stat().st_size / 1e6:.2f} MB), the policy after update {update}")
     own, groups = jax.tree.unflatten(exported.in_tree, map(str, exported.in_avals))[0]
     print(USE.format(path=out, own=own, groups=str(groups).replace("'", "")))
     return 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.words import whole
+from jaxswarm.cli.words import load, whole
 from jaxswarm.config import Config, ConfigError
 
 
@@ -54,3 +54,23 @@ def require_fit(policies: Any, task: Any) -> None:
     needed = jax.eval_shape(lambda: network.init(key, task.observe(task.reset(key))))
     if jax.tree.map(lambda x: x.shape, needed) != jax.tree.map(lambda x: x.shape[1:], policies.params):
         raise ConfigError("the policy cannot be used on this task: it was trained with observations of other sizes")
+
+
+def policy_on_task(
+    run_dir: Path, pairs: Sequence[tuple[str, Any]], options: Mapping[str, str]
+) -> tuple[Any, Any, Any, int] | None:
+    """The task with these changes, and a policy for it: network, parameters, and after which update.
+
+    Of a run with several seeds it is the policy of the first, or of the option `train_seed`. `None` after saying that
+    no checkpoint can be restored.
+    """
+    config = load(run_dir)
+    task = configs.build_part("task", configs.override(config, pairs))
+    trained = which_seeds(options, config)[:1]
+    policies = load_policies(run_dir, config, which_checkpoint(options), trained)
+    if policies is None:
+        return None
+    require_fit(policies, task)
+    from jaxswarm.render import of_seed  # noqa: PLC0415
+
+    return task, policies.experiment.network, of_seed(policies.params, 0), policies.update

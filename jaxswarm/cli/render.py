@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
-from jaxswarm.cli.words import load, only_of_task, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.policies import policy_on_task
+from jaxswarm.cli.words import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -33,8 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    paths = [Path(word) for word in arguments if "=" not in word]
-    options, words = split([word for word in arguments if "=" in word], OPTIONS)
+    paths, options, words = split_paths(arguments, OPTIONS)
     if not paths:
         raise ConfigError("give at least one run folder: jaxswarm-render PATH [key=value ...]")
     seed = whole("seed", options.get("seed", 0), 0)
@@ -65,15 +64,11 @@ def _film(
     run_dir: Path, pairs: Sequence[tuple[str, Any]], options: Mapping[str, str], seed: int, num_films: int
 ) -> Any:
     """An episode of the policy of a run; `None` if it cannot be restored. All films together stay below the limit."""
-    config = load(run_dir)
-    task = configs.build_part("task", configs.override(config, pairs))
-    trained = which_seeds(options, config)[:1]
-    policies = load_policies(run_dir, config, which_checkpoint(options), trained)
-    if policies is None:
+    found = policy_on_task(run_dir, pairs, options)
+    if found is None:
         return None
-    require_fit(policies, task)
     from jaxswarm import render  # noqa: PLC0415
 
-    title = f"{run_dir.name}, {render.describe(task)}, after update {policies.update}"
-    params, limit = render.of_seed(policies.params, 0), render.MAX_SHARES // num_films
-    return render.record(task, policies.experiment.network, params, seed=seed, title=title, max_shares=limit)
+    task, network, params, update = found
+    title = f"{run_dir.name}, {render.describe(task)}, after update {update}"
+    return render.record(task, network, params, seed=seed, title=title, max_shares=render.MAX_SHARES // num_films)

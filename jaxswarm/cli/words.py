@@ -68,6 +68,11 @@ def split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, str
     return options, words
 
 
+def split_paths(arguments: Sequence[str], names: Sequence[str]) -> tuple[list[Path], dict[str, str], list[str]]:
+    """The words without a =, which are paths, and `split` of the others."""
+    return [Path(word) for word in arguments if "=" not in word], *split([x for x in arguments if "=" in x], names)
+
+
 def only(
     pairs: Sequence[tuple[str, Any]], is_accepted: Callable[[str], bool], accepted: str, options: Sequence[str] = ()
 ) -> None:
