@@ -32,7 +32,7 @@ Layout = Literal["streaming", "dense", "segments"]
 
 LOWEST = float(np.finfo(np.float32).min)  # the identity of max; finite, so that differences are numbers
 _FASTEST: dict[str, Layout] = {"add": "streaming", "max": "dense", "scaled_add": "segments"}  # by reduction
-_UNROLL = 10  # slots per loop iteration of the streaming layout
+_UNROLL = 10  # slots per loop iteration of the streaming layout, if a message has one part; of more, one slot
 _PIECE = {"streaming": 2**16, "dense": 2**18, "segments": 2**18}  # numbers in one array of activations
 
 
@@ -265,7 +265,7 @@ class Pool(nn.Module):
             nn.remat(add_slot, prevent_cse=False),
             variable_broadcast="params",
             split_rngs={"params": False},
-            unroll=_UNROLL,
+            unroll=_UNROLL if monoid.num_parts == 1 else 1,
         )
         sample = monoid.lift(*[jnp.zeros((groups[0].mask.shape[0], self.width))] * monoid.num_parts)
         summary = REDUCTIONS[monoid.reduction].identity(sample)
