@@ -15,7 +15,7 @@ from functools import partial
 import jax
 from timing import gemm_flops, peak_memory, report, seconds
 
-from jaxswarm import config, init, rollout, train
+from jaxswarm import config, ensemble, init, rollout, train
 from jaxswarm.cli.words import split
 from jaxswarm.training import Experiment, evaluate
 
@@ -50,16 +50,16 @@ def main(words: list[str]) -> None:
     lowered = train.lower(experiment, state, experiment.eval_every)
     trace_seconds = time.perf_counter() - start
     start = time.perf_counter()
-    program = lowered.compile()
+    program = lowered.compile(ensemble.compiler_options())
     compile_seconds = time.perf_counter() - start
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=ensemble.compiler_options())
     def collect(state):
         policy = partial(experiment.network.apply, state.learner.params, method="policy")
         sizes = experiment.num_steps, experiment.num_start_states
         return rollout.collect(jax.random.key(1), experiment.task, policy, state.worlds, *sizes)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=ensemble.compiler_options())
     def update(state, trajectory):
         key = jax.random.key(2)
         return experiment.learner.update(key, state.learner, experiment.network, experiment.task, trajectory)

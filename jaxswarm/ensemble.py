@@ -27,7 +27,6 @@ from jaxswarm.types import Metrics
 RUNS_AXIS = "runs"
 CPU_WIDTH = 1  # runs side by side on a CPU, whose cache holds the activations of one; measured, see benchmarks/LOG.md
 MEMORY_SHARE = 0.9  # of what is free that a program may take
-CPU_OPTIONS = {"xla_cpu_prefer_vector_width": 512}  # XLA's own choice is 256; measured, see benchmarks/LOG.md
 LESS_MEMORY = "smaller num_worlds, num_steps, num_seeds, eval_worlds or learner.batch_size need less"
 
 Program = Callable[[Experiment, TrainState, Any], tuple[TrainState, Metrics]]  # the last: how many updates
@@ -126,12 +125,11 @@ def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[s
     Where memory holds not even one, it says so before anything is computed.
     """
     num_local = batch.num_runs // (batch.mesh.shape[RUNS_AXIS] if batch.mesh else 1)
-    is_cpu = jax.default_backend() == "cpu"
-    width = math.gcd(num_local, CPU_WIDTH) if is_cpu else num_local
+    width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
     while True:
         with _on(batch):
             lowered = _advance.lower(batch.experiments, states, np.int32(0), size, width, batch.mesh)
-            program = lowered.compile(CPU_OPTIONS if is_cpu else None)
+            program = lowered.compile(compiler_options())
         needed, free = _memory(program), _free_memory()
         if needed <= free:
             break
@@ -144,6 +142,11 @@ def compile_batch(batch: Batch, states: TrainState, size: int, warn: Callable[[s
         warn(f"{num_local} runs side by side need {sizes}: {width} at a time")
 
     return lambda experiments, states, num_updates: program(experiments, states, np.int32(num_updates))
+
+
+def compiler_options() -> dict[str, Any] | None:
+    """What XLA is told beside its defaults: to use vectors of 512 bits where a CPU has them; see benchmarks/LOG.md."""
+    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
 
 
 @partial(jax.jit, static_argnames=("size", "width", "mesh"), donate_argnames="states")

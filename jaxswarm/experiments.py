@@ -28,6 +28,8 @@ from jaxswarm.sweep import Trial
 
 CURVES = Path(__file__).resolve().parent / "data" / "curves"  # of the thesis
 FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables
+KEPT_OF_MANIFEST = ("started", "versions", "platform", "device", "git_revision")
+KEPT_OF_ROWS = ("update", "agent_steps", "wall_seconds", "seed", RETURN)
 NUM_REDRAWN = 200  # times that seeds are redrawn, to see how certain a claim is
 
 
@@ -80,9 +82,27 @@ def load(name: str) -> Figure:
     return Figure(name=name, references=references, thesis=thesis, **fields)
 
 
-def stored(directory: Path) -> list[RunFolder]:
-    """All runs in the directory, of any figure."""
-    return [runs.read(path) for path in runs.find([directory])] if any(directory.glob("*/manifest.json")) else []
+def stored(*directories: Path) -> list[RunFolder]:
+    """All runs in the directories, of any figure; of folders with the same name the longest one."""
+    found: dict[str, RunFolder] = {}
+    for directory in directories:
+        for manifest in sorted(directory.glob("*/manifest.json")):
+            folder = runs.read(manifest.parent)
+            found[folder.path.name] = max(found.get(folder.path.name, folder), folder, key=lambda one: len(one.rows))
+    return list(found.values())
+
+
+def keep(folder: RunFolder, directory: Path) -> None:
+    """Copies the little that reports read of a run: config, evaluations, and where it was trained by what code."""
+    kept = directory / folder.path.name
+    if kept.resolve() == folder.path.resolve():
+        return
+    kept.mkdir(parents=True, exist_ok=True)
+    replace_text(kept / "config.yaml", (folder.path / "config.yaml").read_text())
+    manifest = {name: x for name, x in _manifest(folder).items() if name in KEPT_OF_MANIFEST}
+    replace_text(kept / "manifest.json", json.dumps(manifest, indent=2) + "\n")
+    of_evaluations = [{name: x for name, x in row.items() if name in KEPT_OF_ROWS} for row in folder.rows]
+    reporting.write_rows(kept / "metrics.csv", of_evaluations)
 
 
 def plan(
@@ -143,11 +163,9 @@ def is_of(folder: RunFolder, config: Config) -> bool:
 
 def origin(folder: RunFolder) -> tuple[str, str]:
     """On what device it was trained, and by what revision of the code, in its last session."""
-    try:
-        manifest = json.loads((folder.path / "manifest.json").read_text())
-        return manifest["device"]["backend"], (manifest["git_revision"] or "unknown")[:12]
-    except (OSError, ValueError, KeyError):
-        return "unknown devices", "unknown"
+    manifest = _manifest(folder)
+    device = manifest.get("device", {}).get("backend", "unknown devices")
+    return device, (manifest.get("git_revision") or "unknown")[:12]
 
 
 def of_thesis(figure: Figure) -> dict[str, Measured]:
@@ -177,6 +195,13 @@ def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Pa
         replace_text(out / f"{figure.name}.csv", plots.table(picture))
         files.append(out / f"{name}.png")
     return [*files, out / f"{figure.name}.csv"]
+
+
+def _manifest(folder: RunFolder) -> dict[str, Any]:
+    try:
+        return json.loads((folder.path / "manifest.json").read_text())
+    except (OSError, ValueError):
+        return {}
 
 
 def _claim(says: str, kind: str, series: Sequence[str], **numbers: int | float) -> Claim:

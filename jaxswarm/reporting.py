@@ -114,12 +114,16 @@ def keep_rows_before(path: Path, update: int) -> list[Row]:
     """Removes rows from `update` on, and any torn line; what remains is returned."""
     rows = [row for row in read_rows(path) if row["update"] < update]
     if path.exists():
-        columns = _header(path) if rows else []
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerows([columns, *([_cell(row[name]) for name in columns] for row in rows)] if rows else [])
-        replace_text(path, buffer.getvalue())
+        write_rows(path, rows)
     return rows
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Replaces the file; all rows have the same columns, and without any the file is empty."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerows([list(rows[0]), *([_cell(x) for x in row.values()] for row in rows)] if rows else [])
+    replace_text(path, buffer.getvalue())
 
 
 def draw_curve(path: Path, rows: Sequence[Row], title: str) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import math
+import shutil
 
 import jax
 import numpy as np
@@ -391,6 +392,30 @@ def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| μ only | 2 |" in report
     assert "Trained on cpu, revisions of the code: 0123456789ab." in report
+    kept = tmp_path / "out" / "runs" / "mine"
+    assert {path.name for path in kept.iterdir()} == {"config.yaml", "manifest.json", "metrics.csv"}
+    assert not (kept.parent / "odd").exists()
+    shutil.rmtree(tmp_path / "mine")  # of what was reported all that matters is in the report's folder
+    shutil.rmtree(tmp_path / "odd")
+    assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
+    assert (tmp_path / "out" / "report.md").read_text() == report
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_kept_of_a_run_is_all_that_reports_read(trained, tmp_path):
+    figure, whole = experiments.load("fig_6_15"), trained("whole", 0, 2)
+    (folder,) = experiments.stored(tmp_path)
+    experiments.keep(folder, tmp_path / "kept")
+    (kept,) = experiments.stored(tmp_path / "kept")
+    assert (kept.config, kept.rows) == (folder.config, folder.rows)
+    assert experiments.origin(kept) == experiments.origin(folder)
+    for found in ([folder], [kept]):
+        (trial, *_) = experiments.plan(figure, tmp_path, found, num_seeds=2)["μ only"]
+        assert trial.run_dir == found[0].path
+    text = (whole / "metrics.csv").read_text()
+    (whole / "metrics.csv").write_text(text + "400,40800000,0,0,1\n")
+    (longest,) = experiments.stored(tmp_path / "kept", tmp_path)
+    assert longest.path == whole
 
 
 def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):

@@ -18,7 +18,8 @@ jaxswarm-experiment all [dir=runs/figures] [out=benchmarks/results] [key=value .
 
 Trains all series of a figure of the thesis as they were trained there, and writes the figure with the curves of the
 thesis behind, a table, and a verdict on each thing that the figure shows. The same command continues after Ctrl-C.
-Figures share run folders where their series are the same. all trains nothing: it reports what has been trained.
+Figures share run folders where their series are the same. all trains nothing: it reports what has been trained, and
+keeps the evaluations of these runs in out/runs, from where later reports take what is not in dir.
 
   seeds=N          of each series; default: as many as verdicts need. More seeds later train only those that are missing
   scale=0.1        a tenth of the updates; verdicts then say that the runs were cut. A larger scale goes on from there
@@ -78,7 +79,8 @@ def _run(arguments: Sequence[str], directory: Path, out: Path, options: dict[str
 def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
     from jaxswarm import experiments, report  # noqa: PLC0415
 
-    found, sections, used = experiments.stored(directory), [], set()
+    kept = out / "runs"
+    found, sections, used = experiments.stored(directory, kept), [], set()
     if not found:
         raise ConfigError(
             f"dir = {directory} holds no run folder; train a figure first, or name the folder of its runs"
@@ -91,8 +93,10 @@ def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
     for folder in found:
         if folder.path not in used:
             print(f"warning: {folder.path} is of no figure", file=sys.stderr)
-    origins = [experiments.origin(folder) for folder in found if folder.path in used]
-    replace_text(out / "report.md", report.page(sections, origins))
+    of_figures = [folder for folder in found if folder.path in used]
+    for folder in of_figures:
+        experiments.keep(folder, kept)
+    replace_text(out / "report.md", report.page(sections, [experiments.origin(folder) for folder in of_figures]))
     print(f"wrote {out / 'report.md'}")
     return 0
 
