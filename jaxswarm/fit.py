@@ -1,8 +1,9 @@
 """The same updates as `train`, in chunks; between them the host shows progress, writes files and saves checkpoints.
 
 While the host works on one chunk's results the device computes the next, so that files cost training no time. The
-arithmetic does not depend on where chunks end: states and metrics are those of `train`, bit by bit, however often a
-run was stopped and resumed. Several seeds, and several runs, are trained side by side; see `ensemble`.
+arithmetic does not depend on where chunks end: states and metrics are those of `train`, compiled with the same options,
+bit by bit, however often a run was stopped and resumed. Several seeds, and several runs, are trained side by side; see
+`ensemble`, which compiles.
 """
 
 import contextlib

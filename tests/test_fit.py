@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import checkpoint, config, recording, reporting
+from jaxswarm import checkpoint, config, ensemble, recording, reporting
 from jaxswarm import fit as fitting
 from jaxswarm.config import ConfigError
 from jaxswarm.fit import DivergedError, fit
@@ -58,7 +58,9 @@ def assert_resumes_to_the_same(run_dir, undisturbed):
 
 def test_chunks_are_the_single_program_bit_by_bit(undisturbed):
     state, rows, _ = undisturbed
-    expected, metrics = jaxswarm.train(EXPERIMENT, jaxswarm.init(EXPERIMENT, jax.random.key(3)), NUM_UPDATES)
+    start = jaxswarm.init(EXPERIMENT, jax.random.key(3))
+    train = jaxswarm.train.lower(EXPERIMENT, start, NUM_UPDATES).compile(ensemble.compiler_options())
+    expected, metrics = train(EXPERIMENT, start)
     assert_same_state(state, expected)
     metrics = jax.device_get(metrics)
     assert metrics.pop("is_finite").all()
