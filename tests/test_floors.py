@@ -12,7 +12,7 @@ import jaxswarm
 PACKAGE = Path(jaxswarm.__file__).parent
 FLOORS = [
     {"types", "scene", "schema"},
-    {"geometry", "contacts", "sets", "distributions", "export", "imports"},
+    {"geometry", "contacts", "sets", "distributions", "adapters", "export", "imports"},
     {"dynamics", "neighbors", "shapes", "aggregators.monoids", "aggregators.attentive"},
     {"rigid2d", "tasks.swarm", "tasks.evasion", "aggregators.features"},
     {"tasks.rendezvous", "tasks.pursuit", "tasks.arena", "aggregators"},
