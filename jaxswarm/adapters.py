@@ -46,7 +46,7 @@ class Gymnax:
 
     def action_space(self, params: Any = None) -> Any:
         """A `Box` from -1 to 1, [agents, num_actions]; the one thing that takes gymnax to be installed."""
-        from gymnax.environments import spaces  # noqa: PLC0415
+        from gymnax.environments import spaces  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
 
         task = self.task if params is None else params
         return spaces.Box(-1.0, 1.0, (task.num_agents, task.action_dim))
