@@ -10,9 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxswarm.types import Key, Observation
 
 
-@dataclasses.dataclass(
-    frozen=True, eq=False
-)  # compared and hashed by identity, as trainers that compile `step` need it
+@dataclasses.dataclass(frozen=True, eq=False)  # hashed by identity, for those who compile `step`
 class Gymnax:
     """One world of a task as an environment of gymnax 1.0.
 

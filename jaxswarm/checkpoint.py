@@ -40,6 +40,7 @@ class Checkpoints:
 
     def __init__(self, directory: Path, keep: int = 3):
         self._directory = directory.resolve()
+        self._directory.mkdir(parents=True, exist_ok=True)
         self._keep = keep
         self._scores = {update: _read_score(directory, update) for update in _updates(directory)}
         self._writer = ThreadPoolExecutor(1, "checkpoint")
@@ -72,7 +73,6 @@ class Checkpoints:
     def _open(self) -> None:
         import orbax.checkpoint as ocp  # noqa: PLC0415
 
-        self._directory.mkdir(parents=True, exist_ok=True)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=None,
             create=False,

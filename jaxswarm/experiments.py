@@ -86,8 +86,8 @@ def stored(*directories: Path) -> list[RunFolder]:
     """All runs in the directories, of any figure; of folders with the same name the longest one."""
     found: dict[str, RunFolder] = {}
     for directory in directories:
-        for manifest in sorted(directory.glob("*/manifest.json")):
-            folder = runs.read(manifest.parent)
+        for config in sorted(directory.glob("*/config.yaml")):
+            folder = runs.read(config.parent)
             found[folder.path.name] = max(found.get(folder.path.name, folder), folder, key=lambda one: len(one.rows))
     return list(found.values())
 

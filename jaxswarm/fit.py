@@ -77,7 +77,7 @@ def fit(
     `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, at most every
     `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last checkpoint. Raises
     `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints but none can be
-    restored, and `FileExistsError` for a folder with another run in it.
+    restored, and `FileExistsError` for a folder with another run in it, or with evaluations without checkpoints.
     """
     seeds = tuple(range(seed, seed + (num_seeds or 1)))
     if config is None and run_dir is not None:
@@ -110,8 +110,8 @@ def fit_runs(
     the last update of which each has a checkpoint.
     """
     for run in runs:
-        if run.run_dir and not resume and (run.run_dir / "metrics.csv").exists():
-            raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
+        if run.run_dir:
+            _check_folder(run.run_dir, resume)
         for name in run.loggers:
             loggers.load(name)
     with contextlib.ExitStack() as locks:
@@ -119,6 +119,17 @@ def fit_runs(
             if run.run_dir and jax.process_index() == 0:
                 locks.enter_context(locked(run.run_dir))
         return _fit(runs, num_updates, resume, progress, checkpoint_seconds, keep_checkpoints)
+
+
+def _check_folder(run_dir: Path, resume: bool) -> None:
+    """Raises `FileExistsError` if training would replace evaluations in the folder."""
+    if resume and reporting.read_rows(run_dir / "metrics.csv") and not (run_dir / "checkpoints").exists():
+        raise FileExistsError(
+            f"{run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "
+            "accepted: a folder with both, or another one to train it again"
+        )
+    if not resume and (run_dir / "metrics.csv").exists():
+        raise FileExistsError(f"{run_dir} holds a run already; resume it or choose another folder")
 
 
 def _fit(

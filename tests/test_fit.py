@@ -75,6 +75,13 @@ def test_chunks_are_the_single_program_bit_by_bit(undisturbed):
             np.testing.assert_allclose(found, means, rtol=1e-12)
 
 
+def test_evaluations_without_checkpoints_are_not_trained_over(undisturbed, tmp_path):
+    shutil.copytree(undisturbed[2], tmp_path / "kept", ignore=shutil.ignore_patterns("checkpoints"))
+    with pytest.raises(FileExistsError, match="no checkpoints"):
+        fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=tmp_path / "kept", resume=True, **OPTIONS)
+    assert table(tmp_path / "kept") == table(undisturbed[2])
+
+
 def test_the_last_row_evaluates_the_final_policy(undisturbed):
     state, rows, _ = undisturbed
     expected = jaxswarm.evaluate(EXPERIMENT, state)
