@@ -87,27 +87,43 @@ def on_common_grid(curves: Sequence[Curve]) -> tuple[Points, Values]:
     return grid, np.array(values)
 
 
-def summarize(curves: Sequence[Curve], statistic: str) -> Line:
-    """One of `STATISTICS` along the common grid of at least one seed."""
+def summarize(curves: Sequence[Curve], statistic: str, best_share: float = 1.0) -> Line:
+    """One of `STATISTICS` along the common grid of at least one seed; of the best `best_share` of the seeds."""
     grid, values = on_common_grid(curves)
+    values = _best(values, best_share)
     y, lower, upper = STATISTICS[statistic].compute(values)
     return Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(values), axis=0))
 
 
-def redrawn(curves: Sequence[Curve], statistic: str, count: int, rng: np.random.Generator) -> list[Line]:
-    """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of all seeds."""
+def redrawn(
+    curves: Sequence[Curve], statistic: str, count: int, generator: np.random.Generator, best_share: float = 1.0
+) -> list[Line]:
+    """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of those not drawn."""
     grid, values = on_common_grid(curves)
-    of_all = STATISTICS[statistic].compute(values)
+    of_all = STATISTICS[statistic].compute(_best(values, best_share))
     lines = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of points without any seed
         for _ in range(count):
-            drawn = values[rng.integers(len(values), size=len(values))]
+            drawn = _best(values[generator.integers(len(values), size=len(values))], best_share)
             points = STATISTICS[statistic].compute(drawn)
             is_there = ~np.isnan(drawn).all(axis=0)
             y, lower, upper = (np.where(is_there, x, other) for x, other in zip(points, of_all, strict=True))
             lines.append(Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(drawn), axis=0)))
     return lines
+
+
+def num_best(num_seeds: int, share: float) -> int:
+    """How many seeds are the best `share` of so many."""
+    return max(1, round(share * num_seeds))
+
+
+def _best(values: Values, share: float) -> Float[np.ndarray, "best points"]:
+    """The seeds with the highest means over the points that all have."""
+    if share == 1.0:
+        return values
+    means = values[:, ~np.isnan(values).any(axis=0)].mean(axis=1)
+    return values[np.argsort(-means, kind="stable")[: num_best(len(values), share)]]
 
 
 def profile(finals: Float[np.ndarray, " seeds"], at: Points) -> Line:

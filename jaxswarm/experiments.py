@@ -47,8 +47,14 @@ class Figure:
     references: Mapping[str, Line]
     thesis: Mapping[str, str]  # names of the references there
     num_updates: int  # shown; the thesis trained some series for longer
-    num_seeds: int  # from which on there is a verdict
+    num_seeds: int  # of each series, from which on there is a verdict
+    best_share: float  # of the seeds, which is shown: those with the highest means over their curves
     y: tuple[str, ...]  # the pictures, linear and log
+
+    @property
+    def num_shown(self) -> int:
+        """Seeds of a series that are shown, of those from which on there is a verdict."""
+        return curves.num_best(self.num_seeds, self.best_share)
 
     @property
     def pictures(self) -> dict[str, str]:
@@ -77,6 +83,7 @@ def load(name: str) -> Figure:
     fields["series"] = {series: (*words, *own.split()) for series, own in fields["series"].items()}
     fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
     fields["y"] = tuple(fields.pop("y", ["linear"]))
+    fields["best_share"] = float(fields.pop("best_share", 1.0))
     lines = _references(CURVES / f"{reference}.csv") if reference else {}
     references = {own: lines[theirs] for own, theirs in thesis.items() if lines}
     return Figure(name=name, references=references, thesis=thesis, **fields)
@@ -138,7 +145,7 @@ def measure(
 
     As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
     """
-    measured, rng = {}, np.random.default_rng(0)
+    measured, generator = {}, np.random.default_rng(0)
     for series, (trial, *_) in trials.items():
         per_update = trial.experiment.agent_steps_per_update
         end = float(figure.num_updates * per_update)
@@ -146,8 +153,9 @@ def measure(
         seeds = runs.seeds(same, "agent_steps", RETURN, warn, once=True) if any(folder.rows for folder in same) else []
         if seeds:
             shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
-            line = _until(curves.summarize(shifted, "median"), end)
-            redrawn = tuple(_until(one, end) for one in curves.redrawn(shifted, "median", NUM_REDRAWN, rng))
+            line = _until(curves.summarize(shifted, "median", figure.best_share), end)
+            redrawn = curves.redrawn(shifted, "median", NUM_REDRAWN, generator, figure.best_share)
+            redrawn = tuple(_until(one, end) for one in redrawn)
             reference = figure.references.get(series)
             end = min(end, float(reference.x[-1])) if reference else end
             measured[series] = Measured(line, reference or line, end, redrawn)
@@ -176,7 +184,7 @@ def of_thesis(figure: Figure) -> dict[str, Measured]:
 def verdicts(figure: Figure, measured: Mapping[str, Measured]) -> list[Verdict]:
     """One for each claim."""
     theirs = of_thesis(figure)
-    return [claims.judge(claim, measured, theirs, figure.num_seeds) for claim in figure.claims]
+    return [claims.judge(claim, measured, theirs, figure.num_shown) for claim in figure.claims]
 
 
 def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
@@ -185,7 +193,8 @@ def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Pa
     for name, line in figure.references.items():
         source = "thesis" if figure.thesis[name] == name else f"thesis: {figure.thesis[name]}"
         series.append(Series(name, line, f"{source}, {line.num_seeds[0]} runs", is_reference=True))
-    caption = "Median and quartiles over seeds" + ("; dashed: the thesis" if figure.references else "")
+    seeds = "seeds" if figure.best_share == 1 else f"the best {figure.best_share:.0%} of the seeds"
+    caption = f"Median and quartiles over {seeds}" + ("; dashed: the thesis" if figure.references else "")
     out.mkdir(parents=True, exist_ok=True)
     files = []
     for name, log in figure.pictures.items():

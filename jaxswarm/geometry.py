@@ -61,6 +61,13 @@ def unit(vector: Float[Array, "*n 2"], length: Float[Array, "*n"]) -> Float[Arra
     return vector / jnp.where(length > 0, length, 1)[..., None]
 
 
+def course(vector: Float[Array, "*n 2"], length: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
+    """The vector over its `norm`; short of 1e-15 [1, 0], the direction of atan2(0, 0)."""
+    is_long = length > 0
+    along_x = jnp.where(is_long, vector[..., 0], 1)
+    return jnp.stack([along_x, vector[..., 1]], -1) / jnp.where(is_long, length, 1)[..., None]
+
+
 def direction(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
     """Unit vector [cos, sin] of an angle in rad, counter-clockwise from x."""
     return jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1)
@@ -69,7 +76,7 @@ def direction(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
 def bearing(ahead: Float[Array, "*#n 2"], toward: Float[Array, "*#n 2"]) -> Float[Array, "*n 2"]:
     """[cos, sin] of the angle, clockwise, from the unit vector `ahead` to the unit vector `toward`.
 
-    A positive sine means "to my right". Where `toward` is zero, both are.
+    A positive sine means "to my right".
     """
     cos = ahead[..., 0] * toward[..., 0] + ahead[..., 1] * toward[..., 1]
     sin = ahead[..., 1] * toward[..., 0] - ahead[..., 0] * toward[..., 1]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxswarm import sets
 from jaxswarm.aggregators import Mean
 from jaxswarm.distributions import Policy, gaussian
-from jaxswarm.types import Entities, Observation, is_whole, require
+from jaxswarm.types import Entities, Observation, is_flag, is_whole, require
 
 
 def leaky_relu(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -24,7 +24,7 @@ _HIDDEN_INIT = nn.initializers.orthogonal(math.sqrt(2.0))
 
 
 class Encoder(nn.Module):
-    """Dense layers, each followed by the activation, the last one included; then a second stage, if there is one.
+    """Dense layers, each followed by the activation, the last one unless it `ends_linear`; then any second stage.
 
     The last layer yields the parts of a message by one matrix product each, initialised as one matrix.
     """
@@ -33,6 +33,7 @@ class Encoder(nn.Module):
     activation: str
     num_parts: int = 1
     second_stage: nn.Module | None = None
+    ends_linear: bool = False
 
     @nn.compact
     def __call__(self, features: Float[Array, "n dim"]) -> tuple[Float[Array, "n width"], ...]:
@@ -45,7 +46,9 @@ class Encoder(nn.Module):
         kernel = self.param("kernel", _HIDDEN_INIT, (x.shape[-1], size))
         bias = self.param("bias", nn.initializers.zeros, (size,))
         parts = zip(jnp.split(kernel, self.num_parts, 1), jnp.split(bias, self.num_parts), strict=True)
-        outputs = tuple(activation(x @ k + b[None]) for k, b in parts)
+        outputs = tuple(x @ k + b[None] for k, b in parts)
+        if not self.ends_linear:
+            outputs = tuple(map(activation, outputs))
         return outputs if self.second_stage is None else self.second_stage(*outputs)
 
 
@@ -73,6 +76,7 @@ class Tower(nn.Module):
     activation: str
     aggregator: Any
     latent_space: str
+    linear_output_layers: bool
 
     def __call__(self, own: Float[Array, "n own_dim"], groups: dict[str, Entities]) -> Float[Array, "n latent"]:
         """Latent vector of each receiver."""
@@ -108,8 +112,10 @@ class Tower(nn.Module):
         if wanted == "weights":
             return weights
         latent = jnp.concatenate(x, -1)
-        for width in self.decoder:
-            latent = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=_HIDDEN_INIT)(latent))
+        for i, width in enumerate(self.decoder, 1):
+            latent = nn.Dense(width, kernel_init=_HIDDEN_INIT)(latent)
+            if i < len(self.decoder) or not self.linear_output_layers:
+                latent = ACTIVATIONS[self.activation](latent)
         return latent
 
     def _encoders(self, names: list[str]) -> dict[str, nn.Module]:
@@ -118,7 +124,9 @@ class Tower(nn.Module):
         num_parts = self.aggregator.num_parts // max(len(numbers), 1)
 
         def encoder(widths: tuple[int, ...], name: str, second_stage: nn.Module | None = None) -> nn.Module:
-            return Encoder(widths, self.activation, 1 if second_stage else num_parts, second_stage, name=name)
+            size = 1 if second_stage else num_parts
+            ends_linear = self.linear_output_layers and second_stage is None
+            return Encoder(widths, self.activation, size, second_stage, ends_linear, name=name)
 
         shared = {n: encoder(self.shared_encoder, f"second_stage{n}") if self.shared_encoder else None for n in numbers}
         return {m: Beside(tuple(encoder(self.encoder, f"{m}_encoder{n}", shared[n]) for n in numbers)) for m in names}
@@ -129,7 +137,9 @@ class ActorCritic(nn.Module):
 
     `encoder`, `shared_encoder` and `decoder` are layer widths: of each group's own encoder, of layers after it that all
     groups share, and of what follows the aggregates, whose size is the last width before. The log standard deviation
-    of actions is one parameter, the same in all states, or with `std="state"` a second head of the actor.
+    of actions is one parameter, the same in all states, or with `std="state"` a second head of the actor. All layers
+    end with the activation, as in the thesis, or with `linear_output_layers` all but the last before an aggregator and
+    the last of the decoder.
     Initialisation: orthogonal with gain sqrt(2) inside, 0.01 for the action mean and for the head of the log standard
     deviation, 1 for the value, shared log standard deviation 0.
     """
@@ -141,7 +151,10 @@ class ActorCritic(nn.Module):
     aggregator: nn.Module = Mean()
     latent_space: Literal["separate", "shared"] = "separate"
     std: Literal["shared", "state"] = "shared"
+    linear_output_layers: bool = False
     action_dim: int = 2
+
+    __no_type_check__ = True  # checked below, with a message for users
 
     def __post_init__(self) -> None:
         require(self, "tuples of whole numbers from 1", _is_widths, "encoder", "shared_encoder", "decoder")
@@ -149,13 +162,16 @@ class ActorCritic(nn.Module):
         require(self, ", ".join(ACTIVATIONS), lambda x: x in ACTIVATIONS, "activation")
         require(self, "separate, shared", lambda x: x in ("separate", "shared"), "latent_space")
         require(self, "shared, state", lambda x: x in ("shared", "state"), "std")
+        require(self, "True, False", is_flag, "linear_output_layers")
+        require(self, "whole numbers from 1", is_whole(1), "action_dim")
         if hasattr(self.aggregator, "check_width"):
             self.aggregator.check_width((*self.encoder, *self.shared_encoder)[-1])
         super().__post_init__()
 
     def setup(self) -> None:  # noqa: D102
         layers = (self.encoder, self.shared_encoder, self.decoder, self.activation)
-        self.actor, self.critic = (Tower(*layers, self.aggregator, self.latent_space) for _ in range(2))
+        how = (self.aggregator, self.latent_space, self.linear_output_layers)
+        self.actor, self.critic = (Tower(*layers, *how) for _ in range(2))
         self.action_mean = nn.Dense(self.action_dim, kernel_init=nn.initializers.orthogonal(0.01))
         self.value_head = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0))
         if self.std == "state":

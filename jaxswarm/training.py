@@ -17,7 +17,7 @@ from jaxswarm import rollout
 from jaxswarm.learners.on_policy import LearnerState, OnPolicy, batch_size
 from jaxswarm.networks import ActorCritic
 from jaxswarm.rollout import PolicyFn, Worlds
-from jaxswarm.types import Key, Metrics, is_whole, pytree, require, static
+from jaxswarm.types import Key, Metrics, is_flag, is_whole, pytree, require, static
 
 MAX_SAMPLES = 2**31 - 1  # of one update: int32 numbers them
 
@@ -46,10 +46,16 @@ class Experiment:
         sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every")
         require(self, "whole numbers from 1", is_whole(1), *sizes)
         require(self, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "reset_pool")
+        require(self, "True, False", is_flag, "desynchronised_start")
         if self.agent_steps_per_update > MAX_SAMPLES:
             raise ValueError(
                 f"num_worlds * num_steps * num_agents = {self.agent_steps_per_update} is not possible; "
                 f"accepted: up to {MAX_SAMPLES}"
+            )
+        task, network = type(self.task).__name__, self.network
+        if isinstance(network, ActorCritic) and network.action_dim != self.task.action_dim:
+            raise ValueError(
+                f"action_dim = {network.action_dim} is not possible in {task}; accepted: {self.task.action_dim}"
             )
         if isinstance(self.learner, OnPolicy):
             batch_size(self.learner, self.agent_steps_per_update, self.task.num_agents)  # raises if it cannot be

@@ -70,6 +70,11 @@ def is_whole(least: int) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
+def is_flag(value: Any) -> bool:
+    """Accepts truth values, and nothing that stands for one."""
+    return isinstance(value, bool | np.bool_)
+
+
 @pytree
 class Entities:
     """A group of perceived entities, by receiver; absent ones are masked, their features arbitrary but finite."""

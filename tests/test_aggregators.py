@@ -265,6 +265,8 @@ def test_a_histogram_counts_entities_on_the_border_once():
         ("bayesian", {"rectifier": "relu"}, r"rectifier = 'relu' is not possible; accepted: softplus, exp"),
         ("bayesian", {"prior_mean": "vector"}, r"prior_mean = 'vector' .* feature, scalar, fixed, None"),
         ("bayesian", {"variance_encoder": True}, r"variance_encoder = True .* shared, separate"),
+        ("bayesian", {"output_variance": "no"}, r"output_variance = 'no' .* True, False"),
+        ("attentive", {"residual": 1}, r"residual = 1 .* True, False"),
         ("attentive", {"num_heads": 0}, r"num_heads = 0 .* whole numbers from 1"),
         ("attentive", {"pooling": "max"}, r"pooling = 'max' .* mean, query"),
         ("concat", {"max_entities": -1}, r"max_entities = -1 .* whole numbers from 1"),

@@ -49,6 +49,11 @@ RUNS = {
         "Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 177_885),
         "Max Agg.": (10, "mean", "ppo", MEAN_OPT, 286_780),
     }),
+    "fig_6_6": (102_000, 10_200, 500, {
+        "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 100_485),
+        "Mean agg.": (20, "mean", "ppo", MEAN_OPT, 286_780),
+        "Attentive agg.": (20, "attentive", "ppo", ATTENTIVE, 177_885),
+    }),
     "fig_6_8": (256_000, 5120, 200, {
         "Bayesian agg.": (20, "bayesian", "ppo", MEDIUM, 102_725),
         "Mean agg.": (20, "mean", "ppo", MEDIUM, 73_205),
@@ -209,6 +214,8 @@ def test_final_levels_and_steps_are_those_that_the_thesis_was_measured_to_have()
     several = experiments.of_thesis(experiments.load("fig_6_5"))
     finals = [several[name].final() for name in ("Bayesian agg.", "Mean agg.", "Attentive agg.", "Max Agg.")]
     np.testing.assert_allclose(finals, [31.7, 37.7, 20.0, 37.5], atol=0.06)
+    best = experiments.of_thesis(experiments.load("fig_6_6"))
+    np.testing.assert_allclose([best[name].final() for name in best], [42.2, 47.3, 28.3], atol=0.06)
 
 
 def ramp(final, steps, end=100.0, num_seeds=16):
@@ -372,6 +379,18 @@ def test_a_seed_that_two_folders_hold_counts_once(trained, tmp_path):
     found = experiments.stored(tmp_path)
     ours = experiments.measure(figure, experiments.plan(figure, tmp_path, found), found, lambda text: None)
     assert ours["μ only"].num_seeds == 4
+
+
+def test_of_the_best_third_of_seeds_only_these_are_shown(trained, tmp_path):
+    figure = dataclasses.replace(experiments.load("fig_6_15"), best_share=1 / 3, num_seeds=6)
+    trained("six", 0, 6)  # seed s is at 1 + s
+    found = experiments.stored(tmp_path)
+    ours = experiments.measure(figure, experiments.plan(figure, tmp_path, found), found, lambda text: None)["μ only"]
+    assert (ours.num_seeds, figure.num_shown) == (2, 2)
+    np.testing.assert_allclose([ours.line.lower[0], ours.line.y[0], ours.line.upper[0]], [5.25, 5.5, 5.75])
+    rng = np.random.default_rng(1)
+    expected = [np.median(np.sort(rng.integers(1, 7, 6))[-2:]) for _ in range(4000)]
+    assert np.mean([line.y[0] for line in ours.redrawn]) == pytest.approx(np.mean(expected), abs=0.15)
 
 
 def test_a_report_is_not_replaced_by_an_empty_one(tmp_path, capsys):

@@ -204,11 +204,24 @@ def test_leading_axes_are_free():
     np.testing.assert_allclose(other_value.reshape(6), value, atol=1e-6)
 
 
+@pytest.mark.parametrize("widths", [{}, {"encoder": (6, 4)}, {"decoder": (6, 5)}, {"shared_encoder": (6,)}])
+def test_with_linear_output_layers_only_hidden_layers_bend(widths):
+    model = ActorCritic(**{"encoder": (4,), "decoder": (5,)} | widths, linear_output_layers=True)
+    one, two = rendezvous_like(num_rows=3), jax.tree.map(lambda x: x[::-1], rendezvous_like(num_rows=3))
+    between = jax.tree.map(lambda x, y: x if x.dtype == bool else 0.3 * x + 0.7 * y, one, two)
+    tree = jax.jit(model.init)(jax.random.key(0), one)
+    straight = 0.3 * model.apply(tree, one)[1] + 0.7 * model.apply(tree, two)[1]
+    off = np.abs(model.apply(tree, between)[1] - straight)[[0, 2]]  # the row between is its own mirror image
+    assert (off < 1e-5).all() if not widths else (off > 1e-4).all()
+
+
 @pytest.mark.parametrize(
     ("field", "value", "accepted"),
     [
         ("encoder", (), "at least one layer"),
         ("encoder", (8, 0), "tuples of whole numbers from 1"),
+        ("linear_output_layers", "no", "True, False"),
+        ("action_dim", 0, "whole numbers from 1"),
     ],
 )
 def test_impossible_options_are_named(field, value, accepted):

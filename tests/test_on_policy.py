@@ -224,6 +224,7 @@ def test_impossible_hyper_parameters_are_named(learner):
         "num_epochs": 0,
         "batch_size": 0,
         "minibatch": "x",
+        "bootstrap_truncation": "false",
     }.items():
         with pytest.raises(ValueError, match=f"{field} = {value!r} is not possible; accepted: "):
             LEARNERS[learner](**{field: value})

@@ -145,11 +145,18 @@ def test_an_agent_sees_an_evader_as_the_formulas_say():
     assert observe(task, place(task, position=[[10, 1]])).own[0, 1] == 1  # at a wall
 
 
-def test_agents_at_one_place_see_each_other():
-    task = Pursuit(num_agents=2)
-    neighbors = observe(task, place(task, position=[[10, 10], [10, 10]])).groups["neighbors"]
+@pytest.mark.parametrize("torus", [True, False])
+def test_agents_at_one_place_see_each_other_in_the_direction_of_atan2_of_zeros(torus):
+    task = Pursuit(num_agents=2, torus=torus)
+    heading = np.array([0.3, 2.0])
+    obs = observe(task, place(task, position=[[10, 10]] * 2, heading=heading, evader_position=[[10, 10]]))
+    neighbors, evaders = obs.groups["neighbors"], obs.groups["evaders"]
     assert neighbors.mask.all()
-    np.testing.assert_array_equal(neighbors.features, 0)
+    bearing = heading - math.atan2(0.0, 0.0)
+    mine = np.stack([np.cos(bearing), np.sin(bearing)], -1)
+    expected = np.concatenate([np.zeros((2, 1)), mine, mine[::-1]], -1)
+    np.testing.assert_allclose(neighbors.features[:, 0], expected, atol=1e-6)
+    np.testing.assert_allclose(evaders.features[:, 0], expected[:, :3], atol=1e-6)
 
 
 def test_the_reward_is_the_smallest_distance_after_the_move():

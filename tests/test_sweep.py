@@ -144,6 +144,19 @@ def test_the_space_of_the_thesis_gives_configs_for_each_aggregator():
             assert 400 < batch_size(*sizes) < 12_000
 
 
+def test_the_space_of_the_thesis_holds_what_it_found():
+    optuna = pytest.importorskip("optuna")
+    found = {
+        **{"network.encoder.layers": 1, "network.encoder.0": 146, "network.encoder.last": 120},
+        **{"network.decoder.layers": 2, "network.decoder.0": 19, "network.decoder.1": 177, "network.decoder.last": 162},
+        **{"network.activation": "tanh", "network.latent_space": "separate", "learner.batch_size": 1000},
+    }
+    pairs = config.parse(["experiment=rendezvous_thesis"])
+    space = search.load_space("thesis", config.compose_pairs(pairs))
+    suggested = search.suggest(optuna.trial.FixedTrial(found), space, pairs)
+    assert suggested == config.compose(["experiment=rendezvous_thesis", "network=rendezvous_opt"])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -117,6 +117,8 @@ def test_every_number_that_fixes_no_shape_can_be_swept():
         ({"num_worlds": 0}, r"num_worlds = 0 is not possible; accepted: whole numbers from 1"),
         ({"num_steps": 2.5}, r"num_steps = 2.5 is not possible"),
         ({"eval_every": -1}, r"eval_every = -1 is not possible"),
+        ({"desynchronised_start": "no"}, r"desynchronised_start = 'no' is not possible; accepted: True, False"),
+        ({"network": ActorCritic(action_dim=3)}, r"action_dim = 3 is not possible in Rendezvous; accepted: 2"),
         (
             {"learner": LEARNER.replace(batch_size=18)},
             r"batch_size = 18 .* divisors of .* = 24 that are multiples of 3",

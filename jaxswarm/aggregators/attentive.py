@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxswarm import sets
 from jaxswarm.sets import DenseView
-from jaxswarm.types import is_whole, require
+from jaxswarm.types import is_flag, is_whole, require
 
 
 class Attentive(nn.Module):
@@ -36,6 +36,7 @@ class Attentive(nn.Module):
     def __post_init__(self) -> None:
         require(self, "whole numbers from 1", is_whole(1), "num_heads")
         require(self, "mean, query", lambda x: x in ("mean", "query"), "pooling")
+        require(self, "True, False", is_flag, "residual")
         super().__post_init__()
 
     def check_width(self, width: int) -> None:

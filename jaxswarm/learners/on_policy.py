@@ -16,7 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.rollout import Trajectory, spread_rows
-from jaxswarm.types import Key, Metrics, Observation, is_whole, pytree, require, static
+from jaxswarm.types import Key, Metrics, Observation, is_flag, is_whole, pytree, require, static
 
 Params = Any
 Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
@@ -56,6 +56,7 @@ def check(learner: OnPolicy) -> None:
     require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
     require(learner, "whole numbers from 1", is_whole(1), "num_epochs")
     require(learner, "null, whole numbers from 2", lambda x: x is None or is_whole(2)(x), "batch_size")
+    require(learner, "True, False", is_flag, "bootstrap_truncation")
     require(learner, "agents, worlds", lambda x: x in ("agents", "worlds"), "minibatch")
 
 

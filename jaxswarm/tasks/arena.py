@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm import rigid2d
 from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, MAX_SPEED, MAX_TURN_RATE
-from jaxswarm.geometry import bearing, direction, norm, unit
+from jaxswarm.geometry import bearing, course, direction, norm
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks.swarm import NumberRange, after, draw_number
 from jaxswarm.types import Entities, Key, Observation, pytree, static
@@ -126,7 +126,7 @@ class Arena:
         def seen(position: Array, heading: Array) -> Array:
             displacement = position - my_position
             distance = norm(displacement)
-            toward = unit(displacement, distance)
+            toward = course(displacement, distance)
             return jnp.concatenate([distance[:, None], _turn(ahead, toward), _turn(ahead, heading)], -1)
 
         my_position, ahead = window(view.position, agent, 1), window(view.direction, agent, 1)

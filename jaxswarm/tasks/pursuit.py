@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.dynamics import Velocity
-from jaxswarm.geometry import Space, bearing, direction, norm, unit
+from jaxswarm.geometry import Space, bearing, course, direction, norm
 from jaxswarm.neighbors import Neighborhood, neighborhood
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
@@ -209,7 +209,7 @@ class Pursuit:
         neighbors = _entities(distance, bearings, self.visibility_radius, is_present)
         to_evaders = self.space.displacement(me.position, view.evader_position)
         distance = norm(to_evaders)
-        bearings = bearing(me.direction, unit(to_evaders, distance))
+        bearings = bearing(me.direction, course(to_evaders, distance))
         is_present = swarm.is_present(view.active_evaders, self.num_evaders)
         evaders = _entities(distance, bearings, self.evader_visibility_radius, is_present)
         is_active = None if self.active_agents is None else agent < view.active_agents

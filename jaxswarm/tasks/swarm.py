@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxswarm.geometry import Plane, Space, Torus, bearing, norm, unit
+from jaxswarm.geometry import Plane, Space, Torus, bearing, course, norm
 from jaxswarm.neighbors import Neighborhood
-from jaxswarm.types import Key, Metrics, is_whole, pytree, require
+from jaxswarm.types import Key, Metrics, is_flag, is_whole, pytree, require
 
 NumberRange = tuple[int, int]  # lowest and highest
 
@@ -29,7 +29,7 @@ def require_swarm(task: Any, least: int) -> None:
     require(task, "whole numbers from 1", is_whole(1), "episode_length")
     require(task, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "max_neighbors")
     require(task, "positive finite numbers", lambda x: 0 < x < math.inf, "side", "visibility_radius")
-    require(task, "True, False", lambda x: isinstance(x, bool), "torus")
+    require(task, "True, False", is_flag, "torus")
     require_range(task, "active_agents", least, task.num_agents)
 
 
@@ -109,8 +109,9 @@ def pick(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " oth
 
 
 def sight(space: Space, me: Any, them: Any) -> tuple[Float[Array, "others"], Float[Array, "others 4"]]:
-    """Distance; and bearing to them and from them, as [cos, sin] each."""
+    """Distance; and bearing to them and from them, as [cos, sin] each. In one place, both see the other along x."""
     displacement = space.displacement(me.position, them.position)
     distance = norm(displacement)
-    toward = unit(displacement, distance)
-    return distance, jnp.concatenate([bearing(me.direction, toward), bearing(them.direction, -toward)], -1)
+    toward = course(displacement, distance)
+    back = jnp.where(distance[:, None] > 0, -toward, toward)
+    return distance, jnp.concatenate([bearing(me.direction, toward), bearing(them.direction, back)], -1)
