@@ -11,7 +11,7 @@ import inspect
 import itertools
 import math
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -153,6 +153,12 @@ def dump(config: Config) -> str:
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     return OmegaConf.to_yaml(OmegaConf.create(config))
+
+
+def flat(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by dotted key."""
+    parts = {key: value if isinstance(value, dict) else {"": value} for key, value in config.items()}
+    return {f"{key}.{name}" if name else key: x for key, fields in parts.items() for name, x in fields.items()}
 
 
 def parse(words: Sequence[str]) -> list[tuple[str, Any]]:

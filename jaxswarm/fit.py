@@ -25,7 +25,7 @@ from jaxswarm import config as configs
 from jaxswarm import ensemble, loggers, reporting
 from jaxswarm.checkpoint import Restored, replace_text, restore, set_aside_after
 from jaxswarm.ensemble import Batch
-from jaxswarm.recording import Recorder, Run, draw_curve, locked
+from jaxswarm.recording import Recorder, Run, begun_and_new, check_folder, draw_curve, locked
 from jaxswarm.reporting import Row
 from jaxswarm.training import Experiment, TrainState, init
 from jaxswarm.types import Metrics
@@ -35,7 +35,11 @@ MAX_CHUNK = 64  # updates
 
 
 class DivergedError(RuntimeError):
-    """A parameter, a loss or an evaluation is not a finite number, in every run."""
+    """A parameter, a loss or an evaluation is not a finite number, in every run; `rows` are the evaluations of each."""
+
+    def __init__(self, message: str, rows: Sequence[list[Row]]):
+        super().__init__(message)
+        self.rows = list(rows)
 
 
 class _Chunk(NamedTuple):
@@ -77,7 +81,7 @@ def fit(
     `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, at most every
     `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last checkpoint. Raises
     `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints but none can be
-    restored, and `FileExistsError` for a folder with another run in it, or with evaluations without checkpoints.
+    restored, and `FileExistsError` for a folder that holds another run, or evaluations without checkpoints.
     """
     seeds = tuple(range(seed, seed + (num_seeds or 1)))
     if config is None and run_dir is not None:
@@ -107,29 +111,20 @@ def fit_runs(
     """`fit` for several runs in one program; they differ in numbers, seeds and folders.
 
     Returns states with a leading axis, the seeds of the first run first, and the rows of each run. Resumes all from
-    the last update of which each has a checkpoint.
+    the last update of which each has a checkpoint; runs that have begun and new ones are not resumed together.
     """
     for run in runs:
-        if run.run_dir:
-            _check_folder(run.run_dir, resume)
+        check_folder(run, resume)
         for name in run.loggers:
             loggers.load(name)
+    begun, new = begun_and_new([run.run_dir for run in runs if run.run_dir])
+    if begun and new:
+        raise FileExistsError(f"{begun[0]} holds a run and {new[0]} none; accepted: runs that have all begun, or none")
     with contextlib.ExitStack() as locks:
         for run in runs:
             if run.run_dir and jax.process_index() == 0:
                 locks.enter_context(locked(run.run_dir))
         return _fit(runs, num_updates, resume, progress, checkpoint_seconds, keep_checkpoints)
-
-
-def _check_folder(run_dir: Path, resume: bool) -> None:
-    """Raises `FileExistsError` if training would replace evaluations in the folder."""
-    if resume and reporting.read_rows(run_dir / "metrics.csv") and not (run_dir / "checkpoints").exists():
-        raise FileExistsError(
-            f"{run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "
-            "accepted: a folder with both, or another one to train it again"
-        )
-    if not resume and (run_dir / "metrics.csv").exists():
-        raise FileExistsError(f"{run_dir} holds a run already; resume it or choose another folder")
 
 
 def _fit(
@@ -297,7 +292,8 @@ class _Desk:
         """Says which seeds have diverged since the last time; raises if no other is left."""
         diverged = [(recorder, seed) for recorder in self.recorders for seed in recorder.diverged]
         if len(diverged) == self.batch.num_runs:
-            raise DivergedError(f"{diverged[-1][0].reason[diverged[-1][1]]}; training stopped")
+            reason = diverged[-1][0].reason[diverged[-1][1]]
+            raise DivergedError(f"{reason}; training stopped", [recorder.rows for recorder in self.recorders])
         for recorder, seed in diverged[self._num_reported :]:
             where = f" of {recorder.run.run_dir}" if recorder.run.run_dir else ""
             self.progress.warn(f"seed {seed}{where} stays as it was: {recorder.reason[seed]}")

@@ -214,10 +214,11 @@ def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:
 
 
 def _flat(obs: Observation) -> tuple[Float[Array, "n own_dim"], dict[str, Entities]]:
-    """All receivers in one leading axis."""
+    """All receivers in one leading axis; groups may have no slots."""
+    num_receivers = math.prod(obs.own.shape[:-1])
 
     def merge(group: Entities) -> Entities:
         slots, dim = group.features.shape[-2:]
-        return Entities(group.features.reshape(-1, slots, dim), group.mask.reshape(-1, slots))
+        return Entities(group.features.reshape(num_receivers, slots, dim), group.mask.reshape(num_receivers, slots))
 
-    return obs.own.reshape(-1, obs.own.shape[-1]), {name: merge(group) for name, group in obs.groups.items()}
+    return obs.own.reshape(num_receivers, -1), {name: merge(group) for name, group in obs.groups.items()}

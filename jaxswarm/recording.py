@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxswarm import config as configs
 from jaxswarm import reporting
 from jaxswarm.checkpoint import Checkpoints, Restored
 from jaxswarm.config import ConfigError
@@ -18,6 +19,8 @@ from jaxswarm.loggers import LOGGERS, Logger
 from jaxswarm.reporting import RETURN, Row
 from jaxswarm.training import Experiment, TrainState, is_loss
 
+# keys of a config that are not the run's own
+MAY_CHANGE = {*configs.LENGTHS, "checkpoint_seconds", "keep_checkpoints", "render_every", "loggers", "imports"}
 SECONDS_PER_CURVE = 60.0  # from one picture of the curve during training to the next
 
 
@@ -62,6 +65,47 @@ def locked(run_dir: Path) -> Iterator[None]:
         except (ImportError, OSError):
             pass
         yield
+
+
+def begun_and_new(run_dirs: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Folders of runs that go on together; and those that are empty where others have checkpoints."""
+    has_checkpoint = {path: any(path.glob("checkpoints/[0-9]*")) for path in run_dirs}
+    is_empty = {path: not has_checkpoint[path] and not reporting.read_rows(path / "metrics.csv") for path in run_dirs}
+    new = [path for path in run_dirs if is_empty[path] and any(has_checkpoint.values())]
+    return [path for path in run_dirs if path not in new], new
+
+
+def check_folder(run: Run, resume: bool) -> None:
+    """Raises `FileExistsError` if training would replace what is in the run's folder, or mix it with another run."""
+    if run.run_dir is None:
+        return
+    if not resume:
+        if (run.run_dir / "metrics.csv").exists():
+            raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
+        return
+    rows = reporting.read_rows(run.run_dir / "metrics.csv")
+    if rows and not (run.run_dir / "checkpoints").exists():
+        raise FileExistsError(
+            f"{run.run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "
+            "accepted: a folder with both, or another one to train it again"
+        )
+    others = {int(row["seed"]) for row in rows} - set(run.seeds)
+    changed = {"seeds": (sorted(others), list(run.seeds))} if others else _changes(run)
+    for name, (before, now) in changed.items():
+        raise FileExistsError(f"{run.run_dir} holds a run with {name} = {before}, not {now}; accepted: the same run")
+
+
+def _changes(run: Run) -> dict[str, tuple]:
+    """Keys of the config that resuming may not change, with the value in the folder and that of the run."""
+    path = (run.run_dir or Path()) / "config.yaml"
+    if run.config is None or not path.exists():
+        return {}
+    before = configs.read(path)
+    with contextlib.suppress(ConfigError):  # the config of another version stays as it is
+        before = configs.validate(before)
+    one, other = (configs.flat(config) for config in (before, run.config))
+    names = [name for name in other if name not in MAY_CHANGE and one.get(name) != other[name]]
+    return {name: (one.get(name), other[name]) for name in names}
 
 
 class Recorder:

@@ -63,11 +63,7 @@ def read(path: Path) -> RunFolder:
 
 def fields(config: configs.Config) -> Fields:
     """A config as `Fields`."""
-    flat = {}
-    for key, value in config.items():
-        parts = {f"{key}.{name}": x for name, x in value.items()} if isinstance(value, dict) else {key: value}
-        flat |= {name: x for name, x in parts.items() if name not in NOT_COMPARED}
-    return flat
+    return {name: x for name, x in configs.flat(config).items() if name not in NOT_COMPARED}
 
 
 def group(folders: Sequence[RunFolder]) -> dict[str, list[RunFolder]]:

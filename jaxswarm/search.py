@@ -46,7 +46,7 @@ def load_space(name: str, config: Config) -> Space:
     return space
 
 
-def open_study(storage: str, seed: int, name: str = "jaxswarm") -> "optuna.Study":
+def open_study(storage: str, name: str = "jaxswarm") -> "optuna.Study":
     """The study in a storage: a database's URL, or the path of a journal file that machines may share."""
     try:
         import optuna  # noqa: PLC0415
@@ -57,12 +57,18 @@ def open_study(storage: str, seed: int, name: str = "jaxswarm") -> "optuna.Study
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         where = storage if "://" in storage else optuna.storages.JournalStorage(JournalFileBackend(storage))
-        study = optuna.create_study(storage=where, study_name=name, direction="maximize", load_if_exists=True)
+        return optuna.create_study(storage=where, study_name=name, direction="maximize", load_if_exists=True)
     except Exception as error:
         raise ConfigError(f"storage = {storage} cannot be opened: {' '.join(str(error).split())[:200]}") from error
-    # each process, and each session, draws other numbers
-    study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.get_trials(deepcopy=False)))
-    return study
+
+
+def ask(study: "optuna.Study", seed: int) -> "optuna.Trial":
+    """The next trial. Its number, which no other process gets, tells what is drawn for it."""
+    import optuna  # noqa: PLC0415
+
+    trial = study.ask()
+    study.sampler = optuna.samplers.TPESampler(seed=(seed + trial.number) % 2**32)
+    return trial
 
 
 def num_begun(study: "optuna.Study") -> int:
@@ -89,7 +95,8 @@ def requeue_killed(study: "optuna.Study", sweep_dir: Path) -> None:
 
 def suggest(trial: "optuna.Trial", space: Space, pairs: Sequence[tuple[str, Any]]) -> Config:
     """The config of a trial; `pairs` are what the command line says, and win."""
-    given = {key for key, _ in pairs}
+    composed, groups = configs.compose_pairs(pairs), configs.choices()
+    given = {configs.full_key(key, composed) for key, _ in pairs if key not in groups}
     chosen = [(key, _suggest(trial, key, choice)) for key, choice in space.items() if key not in given]
     config = configs.compose_pairs([*pairs, *[(key, value) for key, value in chosen if key != BATCH_SIZE]])
     wanted = dict(chosen).get(BATCH_SIZE)
@@ -101,11 +108,11 @@ def suggest(trial: "optuna.Trial", space: Space, pairs: Sequence[tuple[str, Any]
     return configs.override(config, [(BATCH_SIZE, sizes[0])])
 
 
-def value(rows: Sequence[Row], seeds: Sequence[int]) -> float:
-    """Mean over all evaluations and seeds; NaN without any. A seed that diverged has its worst from there on."""
+def value(rows: Sequence[Row], seeds: Sequence[int], num_evaluations: int) -> float:
+    """Mean over as many evaluations of all seeds; NaN without any. A seed that diverged has its worst from there on."""
     if not rows:
         return math.nan
-    num_evaluations, worst = len({row["update"] for row in rows}), min(row[RETURN] for row in rows)
+    worst = min(row[RETURN] for row in rows)
     returns = []
     for seed in seeds:
         mine = [row[RETURN] for row in rows if row["seed"] == seed]

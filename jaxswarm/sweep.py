@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from jaxswarm import runs as folders
 from jaxswarm.checkpoint import replace_text
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.fit import DivergedError, fit_runs
-from jaxswarm.recording import Run
+from jaxswarm.recording import Run, begun_and_new
 from jaxswarm.reporting import RETURN, Row
 from jaxswarm.training import Experiment
 
@@ -41,6 +42,11 @@ class Trial:
     def num_updates(self) -> int:
         """How long it is trained."""
         return self.settings.length(self.experiment.agent_steps_per_update)
+
+    @property
+    def num_evaluations(self) -> int:
+        """How often its policies are evaluated, the last ones included."""
+        return math.ceil(self.num_updates / self.experiment.eval_every) + 1
 
     def run(self) -> Run:
         """What `fit_runs` takes."""
@@ -90,8 +96,18 @@ def train(together: Sequence[Trial], progress: bool = True) -> tuple[bool, list[
     """Trains trials that share a program, from where their folders stand.
 
     Returns whether they are finished, which they are not after Ctrl-C, and their rows. Trials of which all seeds
-    diverge are finished.
+    diverge are finished. Those whose folders are new, where others have begun, are trained after these.
     """
+    rows: dict[Path, list[Row]] = {}
+    for run_dirs in filter(None, begun_and_new([trial.run_dir for trial in together])):
+        is_finished, of_part = _train([trial for trial in together if trial.run_dir in run_dirs], progress)
+        rows |= dict(zip(run_dirs, of_part, strict=True))
+        if not is_finished:
+            return False, [[]] * len(together)
+    return True, [rows[trial.run_dir] for trial in together]
+
+
+def _train(together: Sequence[Trial], progress: bool) -> tuple[bool, list[list[Row]]]:
     settings, num_updates = together[0].settings, together[0].num_updates
     try:
         states, rows = fit_runs(
@@ -102,8 +118,8 @@ def train(together: Sequence[Trial], progress: bool = True) -> tuple[bool, list[
             checkpoint_seconds=settings.checkpoint_seconds,
             keep_checkpoints=settings.keep_checkpoints,
         )
-    except DivergedError:
-        return True, [[] for _ in together]
+    except DivergedError as error:
+        return True, error.rows
     return bool(states.update.max() == num_updates or not states.is_finite.any()), rows
 
 

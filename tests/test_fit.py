@@ -12,8 +12,8 @@ import jaxswarm
 from jaxswarm import checkpoint, config, ensemble, recording, reporting
 from jaxswarm import fit as fitting
 from jaxswarm.config import ConfigError
-from jaxswarm.fit import DivergedError, fit
-from jaxswarm.recording import Recorder, locked
+from jaxswarm.fit import DivergedError, fit, fit_runs
+from jaxswarm.recording import Recorder, Run, begun_and_new, locked
 from jaxswarm.tasks import Rendezvous
 from jaxswarm.types import pytree
 
@@ -82,6 +82,34 @@ def test_evaluations_without_checkpoints_are_not_trained_over(undisturbed, tmp_p
     assert table(tmp_path / "kept") == table(undisturbed[2])
 
 
+@pytest.mark.parametrize(
+    ("changes", "seed", "message"),
+    [
+        ({"num_worlds": 4}, 3, "num_worlds = 2, not 4"),
+        ({"learner": EXPERIMENT.learner.replace(learning_rate=1.0)}, 3, r"learner.learning_rate = \S+, not 1.0"),
+        ({}, 4, r"seeds = \[3\], not \[4\]"),
+    ],
+)
+def test_another_run_is_not_resumed(undisturbed, tmp_path, changes, seed, message):
+    shutil.copytree(undisturbed[2], tmp_path / "run")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    with pytest.raises(FileExistsError, match=f"holds a run with {message}"):
+        fit(EXPERIMENT.replace(**changes), 10, seed=seed, run_dir=tmp_path / "run", resume=True, **OPTIONS)
+    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+
+
+def test_a_run_is_not_started_anew_because_one_beside_it_is_new(undisturbed, tmp_path):
+    shutil.copytree(undisturbed[2], tmp_path / "begun")
+    runs = [Run(EXPERIMENT, (3,), tmp_path / name) for name in ("begun", "new")]
+    with pytest.raises(FileExistsError, match=r"begun holds a run and .*new none"):
+        fit_runs(runs, NUM_UPDATES, resume=True, **OPTIONS)
+    assert table(tmp_path / "begun") == table(undisturbed[2])
+    assert begun_and_new([tmp_path / "new", tmp_path / "newer"]) == ([tmp_path / "new", tmp_path / "newer"], [])
+    (tmp_path / "new").mkdir(exist_ok=True)
+    shutil.copy(tmp_path / "begun" / "metrics.csv", tmp_path / "new")  # killed between the first saves of the two
+    assert begun_and_new([tmp_path / "begun", tmp_path / "new"]) == ([tmp_path / "begun", tmp_path / "new"], [])
+
+
 def test_the_last_row_evaluates_the_final_policy(undisturbed):
     state, rows, _ = undisturbed
     expected = jaxswarm.evaluate(EXPERIMENT, state)
@@ -106,13 +134,13 @@ def test_what_python_trained_is_loaded_like_any_run(undisturbed):
     assert_same_state(params, state.learner.params)
 
 
-def test_what_is_not_resumed_keeps_its_config(undisturbed, tmp_path):
+def test_a_checkpoint_of_another_network_is_not_resumed(undisturbed, tmp_path):
     run_dir = shutil.copytree(undisturbed[2], tmp_path / "run")
-    before = (run_dir / "config.yaml").read_text()
+    (run_dir / "config.yaml").unlink()  # which would have told
     other = EXPERIMENT.replace(network=jaxswarm.ActorCritic(encoder=(5,), decoder=(4,)))
     with pytest.raises(checkpoint.CheckpointError):
         fit(other, NUM_UPDATES + 1, seed=3, run_dir=run_dir, resume=True, **OPTIONS)
-    assert (run_dir / "config.yaml").read_text() == before
+    assert not (run_dir / "config.yaml").exists()
 
 
 def test_two_processes_do_not_train_into_one_folder(tmp_path):
@@ -213,6 +241,7 @@ def test_another_run_is_never_overwritten(undisturbed):
 def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkpoint(tmp_path):
     run_dir = tmp_path / "run"
     fit(EXPERIMENT, 3, run_dir=run_dir, **OPTIONS)
+    (run_dir / "config.yaml").unlink()  # so that a run with another rate may be resumed
     diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
     with pytest.raises(DivergedError, match=r"is (nan|inf|not finite) at update \d"):
         fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)

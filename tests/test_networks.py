@@ -179,6 +179,17 @@ def test_every_aggregator_makes_a_network(name):
     assert is_encoded == (AGGREGATORS[name]().num_encoders > 0)
 
 
+@pytest.mark.parametrize("name", AGGREGATORS)
+def test_a_group_may_have_no_slots(name):
+    model = ActorCritic((4,), decoder=(5,), aggregator=AGGREGATORS[name]())
+    obs = pursuit_like(num_rows=2)
+    alone = obs.replace(groups=obs.groups | {"neighbors": jax.tree.map(lambda x: x[:, :0], obs.groups["neighbors"])})
+    tree = jax.eval_shape(model.init, jax.random.key(0), alone)
+    assert jax.eval_shape(model.apply, tree, alone)[1].shape == (2,)
+    weights = jax.eval_shape(partial(model.apply, method="weights"), tree, alone)
+    assert weights["neighbors"].shape == (2, 0)
+
+
 def test_pooling_by_a_query_gets_what_agents_know_of_themselves():
     model = ActorCritic((4,), decoder=(5,), aggregator=AGGREGATORS["attentive"](pooling="query"))
     tree = jax.eval_shape(model.init, jax.random.key(0), rendezvous_like())["params"]["actor"]

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,11 @@ def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, 
         rows = reporting.read_rows(folder / "metrics.csv")
         assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 4) for s in (5, 6)]
         assert {path.name for path in folder.glob("replay-*.html")} == {"replay-0.html", "replay-3.html"}
+    before = {path: path.read_bytes() for path in folders[1].rglob("*") if path.is_file()}
+    shutil.rmtree(folders[0])
+    assert program.main([f"resume={sweep_dir}"]) == 0  # trains what is missing, and leaves what is beside it
+    assert len(reporting.read_rows(folders[0] / "metrics.csv")) == 6
+    assert {path: path.read_bytes() for path in folders[1].rglob("*") if path.is_file()} == before
     alone = config.load(folders[3] / "config.yaml")
     _, expected = fit.fit(config.build(alone), 4, seed=6, progress=False)
     found = [row["eval/return"] for row in reporting.read_rows(folders[3] / "metrics.csv") if row["seed"] == 6]
@@ -93,11 +99,41 @@ def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, 
 
 def test_a_seed_that_diverges_counts_with_its_worst():
     rows = [{"update": u, "seed": 0, "eval/return": float(u)} for u in (0, 10, 20)]
-    assert search.value(rows, [0]) == 10
+    assert search.value(rows, [0], 3) == 10
     rows += [{"update": 0, "seed": 1, "eval/return": -6.0}]
-    assert search.value(rows, [0, 1]) == 2
-    assert search.value(rows, [0, 1, 2]) == (10 - 6 - 6) / 3
-    assert math.isnan(search.value([], [0]))
+    assert search.value(rows, [0, 1], 3) == 2
+    assert search.value(rows, [0, 1, 2], 3) == (10 - 6 - 6) / 3
+    assert search.value(rows[-2:], [0, 1], 3) == (20 * 3 - 6 * 3) / 6  # all have diverged
+    assert math.isnan(search.value([], [0], 3))
+
+
+def test_what_diverged_counts_as_evaluated_to_its_end(tmp_path, monkeypatch):
+    (trial,) = sweep.trials(sweep.expand([*WORDS, "num_updates=7"]), tmp_path)
+    assert trial.num_evaluations == 4  # before updates 0, 3, 6, and after the last
+    rows = [[{"update": 0, "seed": 1, "eval/return": -6.0}]]
+
+    def diverge(*_, **__):
+        raise fit.DivergedError("training stopped", rows)
+
+    monkeypatch.setattr(sweep, "fit_runs", diverge)
+    assert sweep.train([trial], progress=False) == (True, rows)
+
+
+def test_what_the_command_line_says_is_not_searched():
+    optuna = pytest.importorskip("optuna")
+    pairs = config.parse(["encoder=[64]", "batch_size=512", "network=medium"])
+    space = search.load_space("thesis", config.compose_pairs(pairs))
+    suggested = search.suggest(optuna.create_study().ask(), space, pairs)
+    assert (suggested["network"]["encoder"], suggested["learner"]["batch_size"]) == ([64], 512)
+
+
+def test_processes_that_search_together_draw_different_settings(tmp_path):
+    pytest.importorskip("optuna")
+    studies = [search.open_study(str(tmp_path / "journal.log")) for _ in range(2)]
+    widths = [search.ask(study, seed=0).suggest_int("width", 1, 10**6) for study in (*studies, *studies)]
+    assert len(set(widths)) == 4
+    again = search.ask(search.open_study(str(tmp_path / "other.log")), seed=0)
+    assert again.suggest_int("width", 1, 10**6) == widths[0]
 
 
 def test_runs_with_seeds_that_diverged_come_last():
@@ -193,7 +229,7 @@ def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, mo
         assert program.main([*words, f"sweep_dir={tmp_path / 'one'}"]) == 0
     assert "stopped; continue with" in capsys.readouterr().out
     assert program.main([*words, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over
-    study = search.open_study(str(storage), 0)
+    study = search.open_study(str(storage))
     complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
     assert len(complete) == 3
     first = next(trial for trial in complete if Path(trial.user_attrs["run_dir"]).parent.name == "one")

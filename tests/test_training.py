@@ -1,5 +1,7 @@
 """The training program: the same bits in any chunks, side by side over seeds and numbers, evaluations apart."""
 
+from functools import partial
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -109,6 +111,16 @@ def test_every_number_that_fixes_no_shape_can_be_swept():
     params = jax.vmap(final_params, (0, None))(jnp.array([0.0, 1e-3]), rate)
     np.testing.assert_array_equal(params[0], state.learner.params["params"]["actor"]["neighbors_encoder"]["kernel"])
     assert not np.allclose(params[0], params[1])
+
+
+@pytest.mark.parametrize("minibatch", ["agents", "worlds"])
+def test_a_swarm_of_one_trains(minibatch):
+    task = jaxswarm.make("pursuit", num_agents=1, episode_length=5)
+    learner = LEARNERS["ppo"](minibatch=minibatch, batch_size=4)
+    experiment = Experiment(task, NETWORK, learner, num_worlds=2, num_steps=4, eval_worlds=2)
+    state = jax.eval_shape(jaxswarm.init, experiment, jax.random.key(0))
+    _, metrics = jax.eval_shape(partial(jaxswarm.train, num_updates=1), experiment, state)
+    assert metrics["eval/return"].shape == (1,)
 
 
 @pytest.mark.parametrize(

@@ -95,20 +95,21 @@ def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> i
     _save(sweep_dir, options, words)
     use_compile_cache()
     use_cores(config["num_seeds"])
-    study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")), config["seed"])
+    study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")))
     search.requeue_killed(study, sweep_dir)
     while search.num_begun(study) < num_trials:
-        asked = study.ask()
+        asked = search.ask(study, config["seed"])
         run_dir = Path(asked.user_attrs.get(search.RUN_DIR, sweep_dir.resolve() / f"trial-{asked.number:04}"))
         asked.set_user_attr(search.RUN_DIR, str(run_dir))
         of_trial = search.suggest(asked, space, pairs)
         print(f"trial {asked.number}: {json.dumps(asked.params)}", flush=True)
-        is_finished, (rows,) = sweep.train([sweep.Trial(of_trial, configs.build(of_trial), run_dir)])
+        one = sweep.Trial(of_trial, configs.build(of_trial), run_dir)
+        is_finished, (rows,) = sweep.train([one])
         if not is_finished:
             search.requeue(study, asked.number)
             print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return 0
-        search.tell(study, asked, search.value(rows, configs.run_settings(of_trial).seeds))
+        search.tell(study, asked, search.value(rows, one.settings.seeds, one.num_evaluations))
     done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
     for trial in sorted(done, key=lambda trial: trial.value or 0.0, reverse=True)[:5]:
         print(f"{trial.value:10.2f}  {trial.user_attrs[search.RUN_DIR]}  {json.dumps(trial.params)}")

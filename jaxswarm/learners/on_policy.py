@@ -258,7 +258,7 @@ def _batch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) -> B
 
 def _merge(x: Array) -> Array:
     """The two leading axes in one."""
-    return x.reshape(-1, *x.shape[2:])
+    return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
 
 
 def shuffled(key: Key, num_rows: int, num_columns: int) -> Int[Array, "rows columns"]:
