@@ -22,11 +22,22 @@ __all__ = [
     "Experiment",
     "TrainState",
     "evaluate",
+    "experiment",
     "init",
     "load",
     "make",
     "train",
 ]
+
+
+def experiment(*words: str) -> Any:
+    """The `Experiment` that these words of `jaxswarm-train` ask for; a `ConfigError` says what is wrong with them.
+
+    experiment = jaxswarm.experiment("experiment=pursuit_best", "task.num_agents=20")
+    """
+    from jaxswarm import config  # noqa: PLC0415
+
+    return config.build(config.compose(words))
 
 
 def make(name: str, **fields: Any) -> Any:

@@ -120,9 +120,10 @@ def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
 
 
 def load(path: Path) -> Config:
-    """The config of a run, as `dump` wrote it; imports what it was trained with."""
+    """The config of a run, as `dump` wrote it; imports what it was trained with, or the run folder's copies of it."""
     config = read(path)
-    imports.run(config.get("imports", []))
+    places = config.get("imports")
+    imports.run(imports.found(places, path.parent) if isinstance(places, list) else places or [])
     return validate(config)
 
 

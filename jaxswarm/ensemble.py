@@ -10,6 +10,7 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -219,9 +220,20 @@ def _memory(program: Any) -> int:
     return sizes - analysis.alias_size_in_bytes
 
 
+def _allotted(folder: Path = Path("/sys/fs/cgroup")) -> float:
+    """Bytes that a container may still take; infinite without a limit. Files are dropped from memory where needed."""
+    for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+        with contextlib.suppress(OSError, ValueError):  # no such limit, or "max"
+            place = folder if limit == "memory.max" else folder / "memory"
+            stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
+            files = int(stat.get("inactive_file", stat.get("total_inactive_file", 0)))
+            return float(int((place / limit).read_text()) - int((place / used).read_text()) + files)
+    return math.inf
+
+
 def _free_memory() -> float:
     """Bytes that a program may take on each device; infinite if that is not known."""
     if jax.default_backend() == "cpu":
-        return MEMORY_SHARE * psutil.virtual_memory().available / jax.local_device_count()
+        return MEMORY_SHARE * min(psutil.virtual_memory().available, _allotted()) / jax.local_device_count()
     stats = jax.local_devices()[0].memory_stats()
     return MEMORY_SHARE * (stats["bytes_limit"] - stats["bytes_in_use"]) if stats else math.inf

@@ -7,12 +7,14 @@ bit by bit, however often a run was stopped and resumed. Several seeds, and seve
 """
 
 import contextlib
+import dataclasses
 import math
 import os
 import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxswarm import config as configs
-from jaxswarm import ensemble, loggers, reporting
+from jaxswarm import ensemble, imports, loggers, reporting
 from jaxswarm.checkpoint import Restored, replace_text, restore, set_aside_after
 from jaxswarm.ensemble import Batch
 from jaxswarm.recording import Recorder, Run, begun_and_new, check_folder, draw_curve, locked
@@ -81,13 +83,21 @@ def fit(
     `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, at most every
     `checkpoint_seconds`) and `curve.png`; with `resume` the run goes on from its last checkpoint. Raises
     `DivergedError` when no seed is left, `checkpoint.CheckpointError` when there are checkpoints but none can be
-    restored, and `FileExistsError` for a folder that holds another run, or evaluations without checkpoints.
+    restored, `FileExistsError` for a folder that holds another run, or evaluations without checkpoints, and
+    `config.ConfigError` for settings that are not possible.
     """
-    seeds = tuple(range(seed, seed + (num_seeds or 1)))
+    settings = configs.Run(
+        seed=seed,
+        num_seeds=1 if num_seeds is None else num_seeds,
+        num_updates=num_updates,
+        checkpoint_seconds=checkpoint_seconds,
+        keep_checkpoints=keep_checkpoints,
+    )
     if config is None and run_dir is not None:
-        kept = {"checkpoint_seconds": checkpoint_seconds, "keep_checkpoints": keep_checkpoints, "loggers": log_to}
-        config = configs.describe(experiment, num_updates=num_updates, seed=seed, num_seeds=len(seeds), **kept)
-    run = Run(experiment, seeds, None if run_dir is None else Path(run_dir), log_to, config, on_evaluation)
+        config = configs.describe(experiment, **dataclasses.asdict(settings) | {"loggers": log_to})
+        if config is None:
+            warnings.warn(f"{run_dir} gets no config, so that only `fit` reads it; see `config.describe`", stacklevel=2)
+    run = Run(experiment, settings.seeds, None if run_dir is None else Path(run_dir), log_to, config, on_evaluation)
     states, (rows,) = fit_runs(
         [run],
         num_updates,
@@ -147,6 +157,7 @@ def _fit(
     for run in runs:
         if run.run_dir and run.config is not None:
             replace_text(run.run_dir / "config.yaml", configs.dump(dict(run.config)))
+            imports.keep(run.config.get("imports", []), run.run_dir)
     start = restored[0].update if restored else 0
     agent_steps = runs[0].experiment.agent_steps_per_update * batch.num_runs
     with (

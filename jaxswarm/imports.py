@@ -1,12 +1,15 @@
 """A user's own files and modules, which register tasks, aggregators and learners."""
 
 import importlib.util
+import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxswarm.schema import ConfigError
 
+KEPT = "imports"  # folder in a run folder
 have_run: set[str] = set()  # once in a process
 
 
@@ -19,7 +22,7 @@ def run(places: Any) -> Any:
     for place in full:
         if place not in have_run:
             try:
-                _run_file(place) if place.endswith(".py") else importlib.import_module(place)
+                _run(place)
             except Exception as error:  # whatever a user's file leads to
                 raise ConfigError(f"cannot import {place}: {type(error).__name__}: {error}") from error
             have_run.add(place)
@@ -38,6 +41,32 @@ def place(cls: type) -> str | None:
     if module == "__main__" or file is None:
         raise ConfigError(f"{cls.__name__} is in no file that can be imported")
     return module if "." in module else str(Path(file).resolve())
+
+
+def keep(places: Sequence[str], run_dir: Path) -> None:
+    """Copies files into the run folder, for where the folder is taken without them."""
+    for place in places:
+        if place.endswith(".py") and Path(place).exists():
+            (run_dir / KEPT).mkdir(exist_ok=True)
+            shutil.copyfile(place, run_dir / KEPT / Path(place).name)
+
+
+def found(places: Sequence[str], run_dir: Path) -> list[str]:
+    """The places, with what the run folder has kept of files that are no longer there."""
+    kept = [run_dir / KEPT / Path(place).name for place in places]
+    return [
+        str(copy) if place.endswith(".py") and not Path(place).exists() and copy.exists() else place
+        for place, copy in zip(places, kept, strict=True)
+    ]
+
+
+def _run(place: str) -> None:
+    """Runs a file or a module, which may import what is beside it; a module is also looked for where the user is."""
+    is_file = place.endswith(".py")
+    folder = str(Path(place).parent if is_file else Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    _run_file(place) if is_file else importlib.import_module(place)
 
 
 def _run_file(path: str) -> None:

@@ -101,7 +101,9 @@ LOGGERS: dict[str, Callable[[str | Path, Mapping[str, Any] | None, int], Logger]
 
 
 def load(name: str) -> ModuleType:
-    """The package that a logger needs; a `ConfigError` says how to get it."""
+    """The package that a logger needs; a `ConfigError` says how to get it, or which loggers there are."""
+    if name not in PACKAGES:
+        raise ConfigError(f"loggers = {name!r} is not possible; accepted: a list of {', '.join(PACKAGES)}")
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError as error:

@@ -157,6 +157,7 @@ class ActorCritic(nn.Module):
     __no_type_check__ = True  # checked below, with a message for users
 
     def __post_init__(self) -> None:
+        require(self, "aggregators, like Mean()", lambda x: isinstance(x, nn.Module), "aggregator")
         require(self, "tuples of whole numbers from 1", _is_widths, "encoder", "shared_encoder", "decoder")
         require(self, "at least one layer, like [64]", lambda x: len(x) > 0, "encoder")
         require(self, ", ".join(ACTIVATIONS), lambda x: x in ACTIVATIONS, "activation")

@@ -29,6 +29,8 @@ def load(
 ) -> tuple[Experiment, Any]:
     """The experiment of a run folder and the parameters of its policy, of one seed (`None`: the first).
 
+    Of several seeds that were trained side by side, "best" is where the mean of their returns was highest.
+
         experiment, params = jaxswarm.load("runs/NAME")
         distribution = experiment.network.apply(params, experiment.task.observe(state), method="policy")
 

@@ -72,7 +72,8 @@ def trials(wanted: Sequence[Config], sweep_dir: Path) -> list[Trial]:
     ]
     if len(set(labels)) < len(labels):
         names = ", ".join(sorted(folders.NOT_COMPARED))
-        raise ConfigError(f"two runs of the sweep are the same but for {names}; accepted: other values of other keys")
+        accepted = "other values of other keys, and num_seeds=N for N seeds"
+        raise ConfigError(f"two runs of the sweep are the same but for {names}; accepted: {accepted}")
     return [
         Trial(config, experiment, sweep_dir / name)
         for config, experiment, name in zip(wanted, experiments, names, strict=True)

@@ -38,11 +38,13 @@ class Experiment:
     num_worlds: int = static(default=32)
     num_steps: int = static(default=128)
     eval_worlds: int = static(default=20)
-    eval_every: int = static(default=10)
+    eval_every: int = static(default=5)
     desynchronised_start: bool = static(default=True)
     reset_pool: int | None = static(default=None)
 
     def __post_init__(self) -> None:
+        for name, does in {"task": "reset", "network": "apply", "learner": "update"}.items():
+            require(self, f"objects with `{does}`", lambda x, does=does: _has(x, does), name)
         sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every")
         require(self, "whole numbers from 1", is_whole(1), *sizes)
         require(self, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "reset_pool")
@@ -69,6 +71,10 @@ class Experiment:
     def agent_steps_per_update(self) -> int:
         """Environment steps of all agents in one update."""
         return self.num_worlds * self.num_steps * self.task.num_agents
+
+
+def _has(part: Any, method: str) -> bool:
+    return hasattr(part, method) and not isinstance(part, type)
 
 
 @pytree

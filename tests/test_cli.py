@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import checkpoint, policies, reporting, rollout
+from jaxswarm import checkpoint, imports, policies, reporting, rollout
 from jaxswarm import config as configs
 from jaxswarm.cli import evaluate, train, words
 from jaxswarm.fit import abstract_state
@@ -152,8 +153,49 @@ def test_help_shows_groups_choices_and_keys(capsys):
         part in out for part in ("keys of task=pursuit_multi", "task.num_evaders: 5", "learner.clip_range: 0.2 #")
     )
     assert "task.num_evaders: 1" not in out
+    assert train.main(["task=pursuits", "--help"]) == 2
+    assert "did you mean 'pursuit'" in capsys.readouterr().err
+    assert train.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"jaxswarm {jaxswarm.__version__}\n"
     assert evaluate.main(["-h"]) == 0
     assert "task.num_agents=5,10" in capsys.readouterr().out
+
+
+def test_what_users_registered_has_help(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(imports, "have_run", set())
+    text = "import jaxswarm\njaxswarm.TASKS['again'] = type('Again', (jaxswarm.TASKS['pursuit'],), {})\n"
+    (tmp_path / "mine.py").write_text(text)
+    with mock.patch.dict(jaxswarm.TASKS):
+        assert train.main([f"imports={tmp_path / 'mine.py'}", "task=again", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "task=again " in out
+    assert "task.num_evaders: 1\n" in out
+
+
+def test_programs_take_folders_with_any_name(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    folder = tmp_path / "a=b c"
+    folder.mkdir()
+    paths, options, others = words.split_paths([str(folder), "out=~/x.html", "seed=1"], ("out",))
+    assert (paths, options, others) == ([folder], {"out": str(tmp_path / "x.html")}, ["seed=1"])
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [({}, "needs JAX_NUM_PROCESSES"), ({"JAX_NUM_PROCESSES": "x"}, "JAX_NUM_PROCESSES = x is not possible")],
+)
+def test_processes_that_do_not_know_their_number_are_told(monkeypatch, capsys, variables, message):
+    for name in ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, x in {"JAX_COORDINATOR_ADDRESS": "localhost:1", **variables}.items():
+        monkeypatch.setenv(name, x)
+
+    def initialize(num_processes, process_id):
+        raise ValueError("Number of processes must be defined.")
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    assert train.main([]) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [[], ["checkpoint=last", "num_agents=7", "episodes=3"]])
@@ -200,6 +242,14 @@ def test_a_policy_outlives_the_rest_of_its_training_state(finished):
 
 def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch):
     monkeypatch.setattr(rollout, "evaluate", lambda *_: {"return": jnp.ones(()), "capture_time": jnp.full((), jnp.nan)})
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "replace_text", full)
+        assert evaluate.main([str(finished)]) == 1
+    assert "capture_time" in capsys.readouterr().out  # the table is not lost
     assert evaluate.main([str(finished)]) == 0
     *_, table, wrote = capsys.readouterr().out.splitlines()
     assert table.split() == ["capture_time", "-"]
@@ -301,3 +351,7 @@ def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(tmp_path):
     assert {"replay.html", "metrics.csv"} < {path.name for path in (tmp_path / "run").iterdir()}
     (evaluated,) = (tmp_path / "run").glob("eval-*.json")
     assert [x["task"]["price"] for x in json.loads(evaluated.read_text())["results"]] == [0.1, 0.2]
+    (tmp_path / "mine.py").unlink()  # the folder has a copy, on whatever machine it is
+    (tmp_path / "run").rename(tmp_path / "moved")
+    run("train", "resume=moved", "num_updates=3")
+    assert reporting.read_rows(tmp_path / "moved" / "metrics.csv")[-1]["update"] == 3

@@ -1,6 +1,8 @@
 import dataclasses
+import sys
 from unittest import mock
 
+import jax
 import jax.numpy as jnp
 import pytest
 from flax import linen as nn
@@ -226,6 +228,38 @@ def test_a_run_brings_its_imports(registries, tmp_path, monkeypatch):
     assert configs.build(config).task.price == 0.5
 
 
+def test_files_import_what_is_beside_them_and_modules_what_is_here(registries, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "beside.py").write_text("class Priced: pass")
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "mine.py").write_text(OWN)
+    (tmp_path / "other.py").write_text("import jaxswarm, beside\njaxswarm.TASKS['priced'] = beside.Priced\n")
+    configs.compose([f"imports={tmp_path / 'other.py'}"])
+    assert TASKS.pop("priced").__module__ == "beside"
+    monkeypatch.chdir(tmp_path)
+    assert configs.compose(["imports=package.mine", "task=costly"])["imports"] == ["package.mine"]
+
+
+def test_a_run_folder_keeps_the_files_that_it_needs(registries, tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "mine.py").write_text(OWN)
+    config = configs.compose([f"imports={tmp_path / 'mine.py'}", "task=costly"])
+    imports.keep(config["imports"], tmp_path / "run")
+    (tmp_path / "run" / "config.yaml").write_text(configs.dump(config))
+    (tmp_path / "mine.py").unlink()
+    TASKS.pop("costly")
+    monkeypatch.setattr(imports, "have_run", set())
+    assert configs.load(tmp_path / "run" / "config.yaml") == config
+    assert configs.build(config).task.price == 0.5
+
+
+def test_presets_are_experiments_in_python_too():
+    experiment = jaxswarm.experiment("experiment=pursuit_best", "task.num_agents=20")
+    words = ["experiment=pursuit_best", "task.num_agents=20"]
+    assert jax.tree.structure(experiment) == jax.tree.structure(configs.build(configs.compose(words)))
+    assert (type(experiment.task).__name__, experiment.task.num_agents) == ("Pursuit", 20)
+
+
 def run_fields(config):
     return {field.name: config[field.name] for field in dataclasses.fields(configs.Run) if field.name != "imports"}
 
@@ -260,7 +294,8 @@ def test_what_no_config_can_say_has_no_description(change):
     if change == "network":
         experiment = experiment.replace(network=nn.Dense(3))
     if change == "fields":
-        experiment = experiment.replace(network=jaxswarm.ActorCritic(action_dim=3))
+        rates = experiment.learner.replace(learning_rate=jnp.array([1e-3, 1e-2]))
+        experiment = experiment.replace(learner=rates)
     if change == "length":
         num_updates = 0
     assert configs.describe(experiment, num_updates=num_updates) is None

@@ -1,6 +1,7 @@
 """Seeds, numbers and devices side by side: what each run gets does not depend on its company."""
 
 import json
+import math
 import os
 import socket
 import subprocess
@@ -89,6 +90,22 @@ def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time_and_says_if_one
     assert [text[:24] for text in said] == ["4 runs side by side need", "training needs 0.0 GiB a"]
     assert said[0].endswith("1 at a time")
     assert said[1].endswith(ensemble.LESS_MEMORY)
+
+
+def test_what_a_container_may_take_is_its_limit_less_what_it_cannot_drop(tmp_path):
+    assert ensemble._allotted(tmp_path) == math.inf
+    for folder, limit, used, files in (
+        (tmp_path / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        (tmp_path, "memory.max", "memory.current", "inactive_file"),
+    ):
+        folder.mkdir(exist_ok=True)
+        (folder / "memory.stat").write_text(f"anon 5\n{files} 100\n")
+        (folder / limit).write_text("1000\n")
+        (folder / used).write_text("700\n")
+        assert ensemble._allotted(tmp_path) == 400
+    (tmp_path / "memory" / "memory.limit_in_bytes").unlink()
+    (tmp_path / "memory.max").write_text("max\n")
+    assert ensemble._allotted(tmp_path) == math.inf
 
 
 @pytest.fixture(scope="module")

@@ -110,6 +110,34 @@ def test_a_run_is_not_started_anew_because_one_beside_it_is_new(undisturbed, tmp
     assert begun_and_new([tmp_path / "begun", tmp_path / "new"]) == ([tmp_path / "begun", tmp_path / "new"], [])
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_updates": 0}, "num_updates = 0"),
+        ({"num_seeds": 0}, "num_seeds = 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"seed": 2**32}, "seed = 4294967296"),
+        ({"keep_checkpoints": 0}, "keep_checkpoints = 0"),
+        ({"checkpoint_seconds": -1.0}, "checkpoint_seconds = -1.0"),
+        ({"log_to": ("paper",)}, "loggers = 'paper' is not possible; accepted: a list of tensorboard, wandb"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.* gets no config")
+def test_impossible_settings_are_named(tmp_path, options, message):
+    with pytest.raises(ConfigError, match=message):
+        fit(EXPERIMENT, **{"num_updates": 3} | options, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_a_run_folder_without_a_config_is_announced(tmp_path):
+    class Own(jaxswarm.ActorCritic):
+        """A network that no config describes."""
+
+    with pytest.warns(UserWarning, match="run gets no config"):
+        fit(EXPERIMENT.replace(network=Own((4,), (4,))), 1, run_dir=tmp_path / "run", progress=False)
+
+
 def test_the_last_row_evaluates_the_final_policy(undisturbed):
     state, rows, _ = undisturbed
     expected = jaxswarm.evaluate(EXPERIMENT, state)

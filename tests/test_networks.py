@@ -231,6 +231,8 @@ def test_with_linear_output_layers_only_hidden_layers_bend(widths):
     [
         ("encoder", (), "at least one layer"),
         ("encoder", (8, 0), "tuples of whole numbers from 1"),
+        ("aggregator", "mean", "aggregators, like Mean()"),
+        ("aggregator", AGGREGATORS["mean"], "aggregators, like Mean()"),
         ("linear_output_layers", "no", "True, False"),
         ("action_dim", 0, "whole numbers from 1"),
     ],

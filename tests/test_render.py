@@ -153,6 +153,11 @@ def test_a_strip_has_a_row_for_each_film(kinds, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
 
 
+def test_suffixes_may_be_in_capitals_and_paths_texts(tmp_path):
+    render.write(str(tmp_path / "A.HTML"), [episode()])
+    assert [path.name for path in tmp_path.iterdir()] == ["A.HTML"]
+
+
 def test_a_gif_has_so_many_pictures(tmp_path):
     render.write(tmp_path / "a.gif", [episode(num_evaders=1)], frames=4)
     with Image.open(tmp_path / "a.gif") as image:

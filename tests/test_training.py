@@ -130,6 +130,8 @@ def test_a_swarm_of_one_trains(minibatch):
         ({"num_steps": 2.5}, r"num_steps = 2.5 is not possible"),
         ({"eval_every": -1}, r"eval_every = -1 is not possible"),
         ({"desynchronised_start": "no"}, r"desynchronised_start = 'no' is not possible; accepted: True, False"),
+        ({"learner": "ppo"}, r"learner = 'ppo' is not possible; accepted: objects with `update`"),
+        ({"task": jaxswarm.TASKS["pursuit"]}, r"task = .* is not possible; accepted: objects with `reset`"),
         ({"network": ActorCritic(action_dim=3)}, r"action_dim = 3 is not possible in Rendezvous; accepted: 2"),
         (
             {"learner": LEARNER.replace(batch_size=18)},

@@ -18,7 +18,8 @@ jaxswarm-eval PATH [episodes=N] [seed=N] [checkpoint=best|last] [train_seed=N] [
 
 Evaluates the trained policy of a run folder, also on changed tasks: prints a table and writes JSON into the folder.
 The action is the mean of the policy; each episode is played in a world of its own. Of a run with several seeds all
-policies are evaluated, or that of train_seed; the table has means over them, the file has each.
+policies are evaluated, or that of train_seed; the table has means over them, the file has each. The best checkpoint is
+that with the highest mean return over the seeds.
 
 examples
   jaxswarm-eval runs/thesis
@@ -101,13 +102,13 @@ def _report(run_dir: Path, result: dict[str, Any]) -> int:
     name = f"eval-{result['which']}-{time.strftime('%Y%m%d-%H%M%S')}"
     while (path := run_dir / f"{name}.json").exists():
         name += "x"
-    replace_text(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
     num_seeds = len(result["train_seeds"])
     seeds = f" of each of {num_seeds} seeds; means" if num_seeds > 1 else ""
     print(
         f"{run_dir}: {result['which']} checkpoint, of update {result['update']}; {result['episodes']} episodes{seeds}"
     )
     print(_table(result["results"]))
+    replace_text(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
     print(f"wrote {path}")
     return 0
 

@@ -135,12 +135,14 @@ def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
 
 def _keys_help(words: Sequence[str]) -> str:
     """Groups with the first comment of each file, and keys as the files document them, those of the chosen groups."""
+    config = configs.compose(words)  # an error for what does not exist
     lines, chosen = ["groups (* default)"], dict(configs.parse(words))
     main = (configs.config_dir() / "train.yaml").read_text()
     for group, names in configs.choices().items():
         for name in names:
-            text = (configs.config_dir() / group / f"{name}.yaml").read_text()
-            comments = (line[2:] for line in text.splitlines() if line.startswith("# ") and not line.startswith("# @"))
+            path = configs.config_dir() / group / f"{name}.yaml"
+            text = path.read_text().splitlines() if path.exists() else ["# of your own"]
+            comments = (line[2:] for line in text if line.startswith("# ") and not line.startswith("# @"))
             is_default = f"- {group}: {name}\n" in main
             if is_default:
                 chosen.setdefault(group, name)
@@ -148,18 +150,20 @@ def _keys_help(words: Sequence[str]) -> str:
     keys = main[main.index("_self_") :].split("\n", 2)[2].strip().splitlines()
     lines += ["", "keys", *[f"  {line}" for line in keys]]
     for part in configs.PARTS:
-        fields = _documented(part, chosen[part]) if chosen[part] in configs.choices()[part] else {}
+        fields = _documented(part, chosen[part], config)
         if fields:
             lines += ["", f"keys of {part}={chosen[part]}", *[f"  {part}.{line}" for line in fields.values()]]
     return "\n".join(lines)
 
 
-def _documented(part: str, choice: str) -> dict[str, str]:
-    """The lines of a group's file by key, and of those that it builds on."""
+def _documented(part: str, choice: str, config: Config) -> dict[str, str]:
+    """The lines of a group's file by key, and of those that it builds on; what users registered has no file."""
     path = configs.config_dir() / part / f"{choice}.yaml"
+    if not path.exists():
+        return {name: f"{name}: {value}" for name, value in config[part].items() if name != "name"}
     lines = {}
     for default in configs.read(path).get("defaults", []):
-        lines |= _documented(part, default)
+        lines |= _documented(part, default, config)
     of_keys = [line for line in path.read_text().splitlines() if line.partition(": ")[0].isidentifier()]
     return lines | {line.partition(":")[0]: line for line in of_keys if not line.startswith("name:")}
 

@@ -11,19 +11,23 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxswarm import __version__, schema
 from jaxswarm import config as configs
-from jaxswarm import schema
 from jaxswarm.config import Config, ConfigError
 
 
 def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | None], int]:
-    """Turns what users can mend into one line on stderr: 2 for a wrong command, 1 for a run that failed."""
+    """Turns what users can mend into one line on stderr: 2 for a wrong command, 1 for a run that failed.
+
+    Every program also says which version it is.
+    """
 
     @functools.wraps(main)
     def program(arguments: Sequence[str] | None = None) -> int:
         gc.set_threshold(200_000)  # importing and tracing make many objects and little garbage: a tenth of the start
         try:
-            code = main(sys.argv[1:] if arguments is None else arguments)
+            arguments = sys.argv[1:] if arguments is None else arguments
+            code = _tell_version() if list(arguments) == ["--version"] else main(arguments)
             sys.stdout.flush()
             return code
         except ConfigError as error:
@@ -49,6 +53,11 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
     return program
 
 
+def _tell_version() -> int:
+    print(f"jaxswarm {__version__}")
+    return 0
+
+
 def wants_help(arguments: Sequence[str]) -> bool:
     """Whether the user asks how to use the program."""
     return any(word in ("-h", "--help", "help") for word in arguments)
@@ -62,15 +71,16 @@ def split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, str
         if equals and name in names:
             if not value:
                 raise ConfigError(f"{name} has no value")
-            options[name] = value
+            options[name] = os.path.expanduser(value)  # which not every shell does behind a =
         else:
             words.append(word)
     return options, words
 
 
 def split_paths(arguments: Sequence[str], names: Sequence[str]) -> tuple[list[Path], dict[str, str], list[str]]:
-    """The words without a =, which are paths, and `split` of the others."""
-    return [Path(word) for word in arguments if "=" not in word], *split([x for x in arguments if "=" in x], names)
+    """The words without a =, or that exist, which are paths; and `split` of the others."""
+    paths = [word for word in arguments if "=" not in word or Path(word).exists()]
+    return [Path(word) for word in paths], *split([word for word in arguments if word not in paths], names)
 
 
 def only(
@@ -87,7 +97,8 @@ def only_of_task(pairs: Sequence[tuple[str, Any]], config: Config, options: Sequ
     """Raises a `ConfigError` for the first key that is none of the task's."""
     keys = [f"{name}=..." for name in options]
     accepted = ", ".join(["task.<field>=value", *keys])
-    only(pairs, lambda key: configs.full_key(key, config).startswith("task."), accepted, options)
+    meant = [*options, *config["task"], *(f"task.{name}" for name in config["task"])]
+    only(pairs, lambda key: configs.full_key(key, config).startswith("task."), accepted, meant)
 
 
 def whole(name: str, value: Any, least: int) -> int:
@@ -128,10 +139,15 @@ def join_processes() -> bool:
         return True
     import jax  # noqa: PLC0415
 
-    numbers = [os.environ.get(name) for name in ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")]
-    number, index = (None if x is None else whole("JAX_...", x, 0) for x in numbers)
+    number, index = (
+        whole(name, os.environ[name], least) if name in os.environ else None
+        for name, least in (("JAX_NUM_PROCESSES", 1), ("JAX_PROCESS_ID", 0))
+    )
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # processes have to communicate in the same order
-    jax.distributed.initialize(num_processes=number, process_id=index)
+    try:
+        jax.distributed.initialize(num_processes=number, process_id=index)
+    except ValueError as error:  # numbers that are neither given nor known from a cluster
+        raise ConfigError(f"JAX_COORDINATOR_ADDRESS needs JAX_NUM_PROCESSES and JAX_PROCESS_ID: {error}") from error
     return jax.process_index() == 0
 
 

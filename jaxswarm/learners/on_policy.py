@@ -51,7 +51,7 @@ class OnPolicy:
 def check(learner: OnPolicy) -> None:
     """A `ValueError` names the first of these hyper-parameters that is not possible."""
     positive = ("learning_rate", "max_gradient_norm", "adam_epsilon")
-    require(learner, "positive numbers", lambda x: x > 0, *positive)
+    require(learner, "positive finite numbers", lambda x: 0 < x < math.inf, *positive)
     require(learner, "numbers from 0 to 1", lambda x: 0 <= x <= 1, "discount", "gae_lambda")
     require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
     require(learner, "whole numbers from 1", is_whole(1), "num_epochs")

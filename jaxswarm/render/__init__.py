@@ -45,23 +45,25 @@ OPTIONS = {".html": (), ".png": ("frames", "until"), ".gif": ("frames", "until")
 
 def check(path: Path, **options: int) -> None:
     """Raises a `RenderError` for what `write` could not do, before any time is spent on films."""
-    if path.suffix not in FORMATS:
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
         raise RenderError(f"out = {path} is not possible; accepted: names that end in {', '.join(FORMATS)}")
     for name in options:
-        if name not in OPTIONS[path.suffix]:
+        if name not in OPTIONS[suffix]:
             accepted = ", ".join(suffix for suffix, names in OPTIONS.items() if name in names)
-            raise RenderError(f"{name} is not possible for {path.suffix}; accepted: {accepted}")
-    if path.suffix == ".mp4":
+            raise RenderError(f"{name} is not possible for {suffix}; accepted: {accepted}")
+    if suffix == ".mp4":
         pictures.find_ffmpeg()
 
 
-def write(path: Path, films: Sequence[Film], **options: int) -> None:
+def write(path: str | Path, films: Sequence[Film], **options: int) -> None:
     """Writes films in the format of the suffix, as a whole or not at all; the options are in `OPTIONS`."""
+    path = Path(path)
     check(path, **options)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
-        FORMATS[path.suffix](temporary, films, **options)
+        FORMATS[path.suffix.lower()](temporary, films, **options)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
