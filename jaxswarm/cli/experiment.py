@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxswarm import config as configs
 from jaxswarm.checkpoint import replace_text
-from jaxswarm.cli.words import command, program, split, use_compile_cache, use_cores, wants_help, whole
+from jaxswarm.cli.words import command, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -114,10 +114,10 @@ def _section(figure: Any, trials: dict, found: Sequence[Any], out: Path, words: 
 
 def _train(trials: dict) -> bool:
     """Trains series after series, from where their folders stand; whether all have reached their end."""
-    from jaxswarm import experiments, sweep  # noqa: PLC0415
+    from jaxswarm import ensemble, experiments, sweep  # noqa: PLC0415
 
     use_compile_cache()
-    use_cores(math.gcd(*[trial.settings.num_seeds for of_series in trials.values() for trial in of_series]))
+    ensemble.use_cores(math.gcd(*[trial.settings.num_seeds for of_series in trials.values() for trial in of_series]))
     for number, (series, of_series) in enumerate(trials.items()):
         for trial in of_series:
             seeds, steps = trial.settings.seeds, trial.num_updates * trial.experiment.agent_steps_per_update

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
-from jaxswarm.cli.words import command, program, split, use_compile_cache, use_cores, wants_help, whole
+from jaxswarm.cli.words import command, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -58,13 +58,13 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
-    from jaxswarm import sweep  # noqa: PLC0415
+    from jaxswarm import ensemble, sweep  # noqa: PLC0415
 
     trials = sweep.trials(sweep.expand(words), sweep_dir)
     programs = sweep.programs(trials)
     _save(sweep_dir, {}, words)
     use_compile_cache()
-    use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
+    ensemble.use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
     print(f"{_count(trials, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
     for number, together in enumerate(programs):
@@ -86,7 +86,7 @@ def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
 
 
 def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> int:
-    from jaxswarm import search, sweep  # noqa: PLC0415
+    from jaxswarm import ensemble, search, sweep  # noqa: PLC0415
 
     pairs = configs.parse(words)
     config = configs.compose_pairs(pairs)
@@ -94,7 +94,7 @@ def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> i
     num_trials = whole("trials", options.get("trials", 20), 1)
     _save(sweep_dir, options, words)
     use_compile_cache()
-    use_cores(config["num_seeds"])
+    ensemble.use_cores(config["num_seeds"])
     study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")))
     search.requeue_killed(study, sweep_dir)
     while search.num_begun(study) < num_trials:

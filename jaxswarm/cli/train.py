@@ -19,7 +19,6 @@ from jaxswarm.cli.words import (
     resume_command,
     split,
     use_compile_cache,
-    use_cores,
     wants_help,
 )
 from jaxswarm.config import Config, ConfigError
@@ -86,11 +85,11 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     run, experiment = configs.run_settings(config), configs.build(config)
     num_updates = run.length(experiment.agent_steps_per_update)
     use_compile_cache()
-    use_cores(run.num_seeds)
-    from jaxswarm import render  # noqa: PLC0415
+    from jaxswarm import ensemble, render  # noqa: PLC0415
     from jaxswarm.checkpoint import CheckpointError  # noqa: PLC0415
     from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
 
+    ensemble.use_cores(run.num_seeds)
     print(_summary(config, experiment, num_updates, run_dir), flush=True)
     try:
         train_state, rows = fit(

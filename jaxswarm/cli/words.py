@@ -1,6 +1,5 @@
 """What the programs of the command line have in common: words in, exit codes and one line for every mistake out."""
 
-import contextlib
 import functools
 import gc
 import os
@@ -149,20 +148,6 @@ def join_processes() -> bool:
     except ValueError as error:  # numbers that are neither given nor known from a cluster
         raise ConfigError(f"JAX_COORDINATOR_ADDRESS needs JAX_NUM_PROCESSES and JAX_PROCESS_ID: {error}") from error
     return jax.process_index() == 0
-
-
-def use_cores(num_runs: int) -> None:
-    """Makes each core of a CPU a device that trains runs of its own; has to come before any device is used.
-
-    Two cores then train two runs in half the time that both take for one after the other; see benchmarks/LOG.md.
-    """
-    import jax  # noqa: PLC0415
-
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    is_decided = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not is_decided and "JAX_COORDINATOR_ADDRESS" not in os.environ:
-        with contextlib.suppress(RuntimeError):  # called by a program that uses devices already
-            jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
 
 
 def resume_command(run_dir: Path) -> str:
