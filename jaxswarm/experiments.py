@@ -24,7 +24,7 @@ from jaxswarm.curves import Line
 from jaxswarm.plots import Picture, Series
 from jaxswarm.reporting import RETURN
 from jaxswarm.runs import RunFolder
-from jaxswarm.sweep import Trial
+from jaxswarm.trials import Trial
 
 CURVES = Path(__file__).resolve().parent / "data" / "curves"  # of the thesis
 FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from jaxswarm import experiments
 from jaxswarm.claims import Measured, Verdict
 from jaxswarm.experiments import FRACTIONS, Figure
-from jaxswarm.sweep import Trial
+from jaxswarm.trials import Trial
 
 HEAD = """\
 # The figures of the thesis, run again

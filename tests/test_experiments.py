@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxswarm import config as configs
-from jaxswarm import curves, experiments, sweep
+from jaxswarm import curves, experiments, trials
 from jaxswarm.claims import KINDS, Claim, Measured, judge
 from jaxswarm.cli import experiment as program
 from jaxswarm.config import ConfigError
@@ -464,13 +464,13 @@ def test_wrong_words_are_errors(capsys):
 @pytest.mark.usefixtures("few_optimisations")
 def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     words = ["fig_6_15", "seeds=2", f"dir={tmp_path}", *TINY]
-    real, lengths = sweep.train, []
+    real, lengths = trials.train, []
 
-    def train(trials):
-        lengths.append(trials[0].num_updates)
-        return real(trials)
+    def train(together):
+        lengths.append(together[0].num_updates)
+        return real(together)
 
-    monkeypatch.setattr(sweep, "train", train)
+    monkeypatch.setattr(trials, "train", train)
     assert program.main([*words, "scale=0.006", "series=*only"]) == 0
     assert "not enough runs" in capsys.readouterr().out
     assert program.main([*words, "scale=0.006"]) == 0  # trains the other one

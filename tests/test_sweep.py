@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_cli import TINY
 
-from jaxswarm import config, fit, reporting, search, sweep
+from jaxswarm import config, fit, reporting, search, sweep, trials
 from jaxswarm.cli import evaluate
 from jaxswarm.cli import sweep as program
 from jaxswarm.config import ConfigError
@@ -60,14 +60,14 @@ def test_equal_runs_are_refused(tmp_path):
 @pytest.mark.usefixtures("few_optimisations")
 def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, capsys):
     sweep_dir, begun = tmp_path / "sweep", []
-    real = sweep.fit_runs
+    real = trials.fit_runs
 
     def stops_in_the_second_program(runs, num_updates, **options):
         begun.append(runs)
         return real(runs, 2 if len(begun) == 2 else num_updates, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(sweep, "fit_runs", stops_in_the_second_program)
+        patch.setattr(trials, "fit_runs", stops_in_the_second_program)
         assert program.main([*SWEPT, f"sweep_dir={sweep_dir}"]) == 0
     assert "stopped; continue with" in capsys.readouterr().out
     assert not (sweep_dir / "summary.csv").exists()
@@ -115,8 +115,8 @@ def test_what_diverged_counts_as_evaluated_to_its_end(tmp_path, monkeypatch):
     def diverge(*_, **__):
         raise fit.DivergedError("training stopped", rows)
 
-    monkeypatch.setattr(sweep, "fit_runs", diverge)
-    assert sweep.train([trial], progress=False) == (True, rows)
+    monkeypatch.setattr(trials, "fit_runs", diverge)
+    assert trials.train([trial], progress=False) == (True, rows)
 
 
 def test_what_the_command_line_says_is_not_searched():
@@ -140,7 +140,7 @@ def test_runs_with_seeds_that_diverged_come_last():
     wanted = config.compose(WORDS)
 
     def trial(number):
-        return sweep.Trial(wanted, config.build(wanted), Path(f"run{number}"))
+        return trials.Trial(wanted, config.build(wanted), Path(f"run{number}"))
 
     rows = [
         [{"update": 4, "seed": s, "eval/return": x} for s, x in enumerate(xs)] for xs in ([9.0], [1.0, 2.0], [3.0, 4.0])
@@ -223,9 +223,9 @@ def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, mo
     storage = tmp_path / "journal.log"
     words = [*WORDS, f"search={tmp_path / 'space.yaml'}", "trials=3", f"storage={storage}"]
     words = [word for word in words if "batch_size" not in word]
-    real = sweep.fit_runs
+    real = trials.fit_runs
     with monkeypatch.context() as patch:
-        patch.setattr(sweep, "fit_runs", lambda runs, num_updates, **options: real(runs, 2, **options))
+        patch.setattr(trials, "fit_runs", lambda runs, num_updates, **options: real(runs, 2, **options))
         assert program.main([*words, f"sweep_dir={tmp_path / 'one'}"]) == 0
     assert "stopped; continue with" in capsys.readouterr().out
     assert program.main([*words, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over

@@ -114,7 +114,8 @@ def _section(figure: Any, trials: dict, found: Sequence[Any], out: Path, words: 
 
 def _train(trials: dict) -> bool:
     """Trains series after series, from where their folders stand; whether all have reached their end."""
-    from jaxswarm import ensemble, experiments, sweep  # noqa: PLC0415
+    from jaxswarm import ensemble, experiments  # noqa: PLC0415
+    from jaxswarm.trials import train  # noqa: PLC0415
 
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[trial.settings.num_seeds for of_series in trials.values() for trial in of_series]))
@@ -124,7 +125,7 @@ def _train(trials: dict) -> bool:
             length = f"seeds {seeds[0]} to {seeds[-1]}, {steps:,} agent steps"
             print(f"series {number + 1} of {len(trials)}: {series}, {length}")
             print(f"  {trial.run_dir}", flush=True)
-            if not experiments.is_finished(trial) and not sweep.train([trial])[0]:
+            if not experiments.is_finished(trial) and not train([trial])[0]:
                 return False
     return True
 

@@ -59,6 +59,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
     from jaxswarm import ensemble, sweep  # noqa: PLC0415
+    from jaxswarm.trials import train  # noqa: PLC0415
 
     trials = sweep.trials(sweep.expand(words), sweep_dir)
     programs = sweep.programs(trials)
@@ -71,7 +72,7 @@ def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
         num_seeds = together[0].settings.num_seeds
         names = ", ".join(trial.run_dir.name for trial in together)
         print(f"program {number + 1} of {len(programs)}: {names}; seeds of each: {num_seeds}", flush=True)
-        is_finished, of_each = sweep.train(together)
+        is_finished, of_each = train(together)
         if not is_finished:
             print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return 0
@@ -86,7 +87,8 @@ def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
 
 
 def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> int:
-    from jaxswarm import ensemble, search, sweep  # noqa: PLC0415
+    from jaxswarm import ensemble, search  # noqa: PLC0415
+    from jaxswarm.trials import Trial, train  # noqa: PLC0415
 
     pairs = configs.parse(words)
     config = configs.compose_pairs(pairs)
@@ -103,8 +105,8 @@ def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> i
         asked.set_user_attr(search.RUN_DIR, str(run_dir))
         of_trial = search.suggest(asked, space, pairs)
         print(f"trial {asked.number}: {json.dumps(asked.params)}", flush=True)
-        one = sweep.Trial(of_trial, configs.build(of_trial), run_dir)
-        is_finished, (rows,) = sweep.train([one])
+        one = Trial(of_trial, configs.build(of_trial), run_dir)
+        is_finished, (rows,) = train([one])
         if not is_finished:
             search.requeue(study, asked.number)
             print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")

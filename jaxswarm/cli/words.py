@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import importlib.metadata
 import os
 import shlex
 import shutil
@@ -10,8 +11,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxswarm import __version__, schema
 from jaxswarm import config as configs
+from jaxswarm import schema
 from jaxswarm.config import Config, ConfigError
 
 
@@ -53,7 +54,7 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
 
 
 def _tell_version() -> int:
-    print(f"jaxswarm {__version__}")
+    print(f"jaxswarm {importlib.metadata.version('jaxswarm')}")
     return 0
 
 

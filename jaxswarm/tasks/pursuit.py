@@ -64,6 +64,8 @@ class Pursuit:
     Evaders flee from those that they see within `evader_visibility_radius`, which is also how far they are seen.
     Numbers of agents and evaders are drawn for each episode within `active_agents` and `active_evaders`, if given.
     With `max_neighbors` agents perceive their nearest neighbours only, in O(num_agents) memory (see `neighbors`).
+    Without `torus` agents know whether they are at a wall: a coordinate up to 1 or from 99 on, as in the thesis's
+    program, also where `side` is not 100.
     """
 
     num_agents: int = static(default=10)
