@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxswarm.curves import Line, Points
+from jaxswarm.curves import Curve, Line, Points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,6 +50,7 @@ class Series:
     note: str = ""
     is_reference: bool = False
     censored: Points = dataclasses.field(default_factory=lambda: np.empty(0))  # where seeds ended before the event
+    seeds: Sequence[Curve] = ()  # drawn thin behind the line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +122,10 @@ def _in_units(picture: Picture) -> Picture:
     size, label = next((size, label) for least, size, label in units if most >= least)
     scaled = [
         dataclasses.replace(
-            series, line=dataclasses.replace(series.line, x=series.line.x / size), censored=series.censored / size
+            series,
+            line=dataclasses.replace(series.line, x=series.line.x / size),
+            censored=series.censored / size,
+            seeds=[dataclasses.replace(seed, x=seed.x / size) for seed in series.seeds],
         )
         for series in picture.series
     ]
@@ -154,8 +158,10 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
 
 
 def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, style: dict[str, Any]) -> None:
-    """Line, band and marks; pale where some seeds have ended."""
+    """Line, band, seeds and marks; pale where some seeds have ended."""
     line = series.line
+    for seed in series.seeds:
+        axes.plot(seed.x, seed.y, color=style["color"], alpha=0.4, linewidth=0.6, zorder=3)
     behind = {"color": style["color"], "alpha": band_alpha, "linewidth": 0, "zorder": 1}
     axes.fill_between(line.x, line.lower, line.upper, step="post" if is_step else None, **behind)
     is_whole = (line.num_seeds == line.num_seeds.max(initial=0)) | is_step
@@ -220,9 +226,10 @@ def _x_values(picture: Picture) -> np.ndarray:
 
 
 def _y_values(picture: Picture) -> np.ndarray:
-    """All finite heights, bands included."""
+    """All finite heights, bands and seeds included."""
     lines = [series.line for series in picture.series]
-    values = np.concatenate([np.empty(0), *(x for line in lines for x in (line.y, line.lower, line.upper))])
+    seeds = [seed.y for series in picture.series for seed in series.seeds]
+    values = np.concatenate([np.empty(0), *seeds, *(x for line in lines for x in (line.y, line.lower, line.upper))])
     return values[np.isfinite(values)]
 
 

@@ -129,17 +129,19 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 def draw_curve(path: Path, rows: Sequence[Row], title: str) -> None:
     """Evaluation return against agent steps; the figure's format is the suffix.
 
-    Of several seeds it shows the median with the quartiles, of one the mean with the standard deviation over episodes.
+    Of several seeds it shows the median with the quartiles, and each seed thin behind it; of one the mean with the
+    standard deviation over episodes.
     """
     seeds, _ = curves.from_rows(rows, "agent_steps", RETURN)
     if len(seeds) > 1:
         line, what = curves.summarize(list(seeds.values()), "median"), f"median and quartiles of {len(seeds)} seeds"
+        series = plots.Series("", line, seeds=list(seeds.values()))
     else:
         line, what = _mean_over_episodes(rows), "mean ± std"
+        series = plots.Series("", line)
     label = f"return of an episode ({what})"
     caption = "pale where some seeds have no evaluation" if np.unique(line.num_seeds).size > 1 else ""
-    series = [plots.Series("", line)]
-    plots.draw(path, plots.Picture("curve", series, "agent_steps", RETURN, label, title=title, caption=caption))
+    plots.draw(path, plots.Picture("curve", [series], "agent_steps", RETURN, label, title=title, caption=caption))
 
 
 def _mean_over_episodes(rows: Sequence[Row]) -> curves.Line:

@@ -184,6 +184,8 @@ def test_references_are_drawn_with_their_source(runs, reference):
         (["log=y", "y=update"], ["log = y is not possible", "0 to 2"]),
         (["log=y", "kind=profile"], ["log = y is not possible with kind=profile"]),
         (["kind=profile", "statistic=iqm"], ["statistic = iqm has no meaning here"]),
+        (["kind=profile", "seeds=true"], ["seeds = true has no meaning here"]),
+        (["seeds=3"], ["seeds = '3'", "false, true"]),
         (["smooth=0"], ["smooth = 0", "integers from 1"]),
         (["kind=threshold"], ["threshold = ''", "threshold=-30"]),
         (["threshold=3"], ["kind=threshold"]),
@@ -234,6 +236,13 @@ def test_evaluations_that_are_not_finite_are_left_out_and_told(runs, tmp_path, c
     assert err == f"warning: {folder}: 2 evaluations left out, eval/return is not a finite number there\n"
     assert out.startswith("rendezvous, mean, ppo: 1 seed\n")
     assert [row["y"] for row in read("x.csv")] == ["-9.0"]
+
+
+@pytest.mark.parametrize(("words", "count"), [([], 0), (["seeds=true"], 5), (["seeds=true", "smooth=2"], 5)])
+def test_each_seed_is_shown_if_asked_for(runs, words, count):
+    assert plot.main([str(runs), "out=x.svg", *words]) == 0
+    assert plot.Path("x.svg").read_text().count("stroke-width: 0.6;") == count
+    assert ("and each seed" in text_of("x.svg")) == (count > 0)
 
 
 def test_many_series_share_no_colour_and_marker():

@@ -67,7 +67,9 @@ def test_a_curve_is_drawn_from_any_number_of_rows(tmp_path, num_rows):
 def test_the_curve_of_several_seeds_shows_their_median(tmp_path):
     rows = [make_row(i, seed=seed) for i in range(3) for seed in (4, 5, 6)]
     reporting.draw_curve(tmp_path / "curve.svg", rows, "three")
-    assert "median and quartiles of 3 seeds" in (tmp_path / "curve.svg").read_text()
+    text = (tmp_path / "curve.svg").read_text()
+    assert "median and quartiles of 3 seeds" in text
+    assert text.count("stroke-width: 0.6;") == 3
     reporting.draw_curve(tmp_path / "curve.svg", rows[::3], "one")
     assert "mean ± std" in (tmp_path / "curve.svg").read_text()
 

@@ -29,6 +29,7 @@ evaluation are one group; the groups are named by what they differ in.
   kind=curve               curve; profile: how many seeds end above each return; threshold: how many reached one, when
   threshold=VALUE          of kind=threshold
   statistic=median         median with quartiles; iqm: interquartile mean with 95 % stratified bootstrap intervals
+  seeds=true               each seed thin behind the line of its group; of kind=curve
   y=eval/return            any column of metrics.csv
   x=agent_steps            agent_steps, wall_seconds or update
   log=                     logarithmic axes: x, y or xy
@@ -55,6 +56,7 @@ class Options:
     kind: str = "curve"
     threshold: str = ""
     statistic: str = "median"
+    seeds: str = "false"
     y: str = "eval/return"
     x: str = "agent_steps"
     log: str = ""
@@ -75,6 +77,8 @@ class Options:
             raise ConfigError(f"threshold = {self.threshold} has no meaning here; accepted with kind=threshold")
         if self.statistic != Options.statistic and self.kind != "curve":
             raise ConfigError(f"statistic = {self.statistic} has no meaning here; accepted with kind=curve")
+        if self.seeds == "true" and self.kind != "curve":
+            raise ConfigError("seeds = true has no meaning here; accepted with kind=curve")
         if self.reference and (self.kind, self.x) != ("curve", "agent_steps"):
             raise ConfigError("reference has no meaning here; accepted with kind=curve and x=agent_steps")
         if self.series and not self.reference:
@@ -196,9 +200,12 @@ def _curve(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
     lines = {label: curves.summarize(seeds, options.statistic) for label, seeds in groups.items()}
     series = []
     for label, line in lines.items():
+        shown = groups[label] if options.seeds == "true" else ()
         most, last = int(line.num_seeds.max()), int(line.num_seeds[-1])
-        series.append(Series(label, line, _count(most) + (f", {last} at the end" if last < most else "")))
+        note = _count(most) + (f", {last} at the end" if last < most else "")
+        series.append(Series(label, line, note, seeds=shown))
     caption = f"{statistic.name} and {statistic.band} over seeds".capitalize()
+    caption += ", and each seed" if options.seeds == "true" else ""
     if any(np.ptp(line.num_seeds) for line in lines.values()):
         caption += "; pale where not all seeds have values"
     height = f"{options.statistic} of {options.y}"
@@ -245,6 +252,7 @@ KINDS: dict[str, Callable[[Mapping[str, Sequence[Curve]], Options], Picture]] = 
 CHOICES = {
     "kind": tuple(KINDS),
     "statistic": tuple(STATISTICS),
+    "seeds": ("false", "true"),
     "x": ("agent_steps", "wall_seconds", "update"),
     "log": ("", "x", "y", "xy"),
 }
