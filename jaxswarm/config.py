@@ -28,6 +28,7 @@ NO_PRESET = ("experiment", None)
 PARTS = (*REGISTERED, "network")  # what an experiment is made of, one dict each
 SEARCHES = "search"  # the folder of search spaces, which are no part of a config
 FIGURES = "figure"  # that of figures, each of several configs
+INIT_FROM = "init_from"  # the key of the folder with the policy to begin with
 LENGTHS = ("num_updates", "total_agent_steps")  # two ways to say the same
 
 
@@ -43,6 +44,7 @@ class Run:
     keep_checkpoints: int = 3
     render_every: int | None = None
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    init_from: str | None = None
     imports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -105,6 +107,7 @@ def compose_pairs(pairs: Sequence[tuple[str, Any]]) -> Config:
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     pairs = [(key, imports.run(value)) if key == "imports" else (key, value) for key, value in pairs]
+    pairs = [(key, str(Path(value).resolve()) if key == INIT_FROM and value else value) for key, value in pairs]
     groups = choices()
     chosen = {
         key: _choice(key, value, groups[key]) for key, value in pairs if key in groups and (key, value) != NO_PRESET

@@ -7,6 +7,7 @@ XLA adds up gradients across devices.
 """
 
 import contextlib
+import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -115,6 +116,13 @@ def init_batch(batch: Batch, seeds: Sequence[int]) -> TrainState:
     seeds_array = np.asarray(seeds, np.uint32)
     shapes = jax.eval_shape(_start, batch.experiments, seeds_array)
     return jax.jit(_start, out_shardings=_shardings(batch.mesh, shapes))(batch.experiments, seeds_array)
+
+
+def begin_with(states: TrainState, params: Sequence[Any]) -> TrainState:
+    """The states with these parameters, of one network for each run."""
+    given = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *params)
+    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), given, states.learner.params)
+    return dataclasses.replace(states, learner=dataclasses.replace(states.learner, params=placed))
 
 
 def _start(experiments: Experiment, seeds: UInt[Any, " runs"]) -> TrainState:

@@ -29,6 +29,7 @@ from jaxswarm.checkpoint import Restored, replace_text, restore, set_aside_after
 from jaxswarm.ensemble import Batch
 from jaxswarm.recording import Recorder, Run, begun_and_new, check_folder, draw_curve, locked
 from jaxswarm.reporting import Row
+from jaxswarm.schema import ConfigError
 from jaxswarm.training import Experiment, TrainState, init
 from jaxswarm.types import Metrics
 
@@ -68,6 +69,7 @@ def fit(
     log_to: tuple[str, ...] = (),
     config: Mapping[str, Any] | None = None,
     on_evaluation: Callable[[int, Any], None] | None = None,
+    init_params: Any = None,
 ) -> tuple[TrainState, list[Row]]:
     """Trains until `num_updates` updates are done, or until Ctrl-C or SIGTERM, after the current chunk.
 
@@ -77,7 +79,8 @@ def fit(
     there is a row for each. A seed whose numbers stop being finite stays as it was before.
 
     `log_to` are names in `loggers.LOGGERS`; `on_evaluation` is called with the update and the parameters [seeds, ...]
-    of each evaluated policy but the last.
+    of each evaluated policy but the last. All seeds begin with `init_params`, where they are given: parameters of a
+    network of the same shapes, as `jaxswarm.load` gives them, trained in a swarm of any size.
 
     With `run_dir` the folder gets `config.yaml` (`config`, by default what `config.describe` says, if anything),
     `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, at most every
@@ -97,7 +100,8 @@ def fit(
         config = configs.describe(experiment, **dataclasses.asdict(settings) | {"loggers": log_to})
         if config is None:
             warnings.warn(f"{run_dir} gets no config, so that only `fit` reads it; see `config.describe`", stacklevel=2)
-    run = Run(experiment, settings.seeds, None if run_dir is None else Path(run_dir), log_to, config, on_evaluation)
+    folder = None if run_dir is None else Path(run_dir)
+    run = Run(experiment, settings.seeds, folder, log_to, config, on_evaluation, init_params)
     states, (rows,) = fit_runs(
         [run],
         num_updates,
@@ -125,6 +129,7 @@ def fit_runs(
     """
     for run in runs:
         check_folder(run, resume)
+        _check_params(run)
         for name in run.loggers:
             loggers.load(name)
     begun, new = begun_and_new([run.run_dir for run in runs if run.run_dir])
@@ -168,15 +173,35 @@ def _fit(
         wall_seconds = restored[0].record["wall_seconds"] if restored else 0.0
         desk = _Desk(batch, recorders, shown, start, wall_seconds, checkpoint_seconds)
         try:
-            if restored:
-                states = ensemble.place(batch, _joined(restored))
-            else:
-                states = ensemble.init_batch(batch, [seed for run in runs for seed in run.seeds])
+            states = ensemble.place(batch, _joined(restored)) if restored else _initial(batch, runs)
             states = _train(states, num_updates, desk, stop)
         finally:
             for recorder in recorders:
                 recorder.close()
     return states, [recorder.rows for recorder in recorders]
+
+
+def _check_params(run: Run) -> None:
+    """Raises a `ConfigError` for parameters that are not those of the run's network."""
+    if run.init_params is None:
+        return
+    needed = abstract_state(run.experiment).learner.params
+    if jax.tree.map(np.shape, run.init_params) != jax.tree.map(lambda x: x.shape[1:], needed):
+        raise ConfigError(
+            "the policy to begin with has parameters of other shapes; accepted: one of the same network, "
+            "trained with as many features and actions"
+        )
+
+
+def _initial(batch: Batch, runs: Sequence[Run]) -> TrainState:
+    """The states before the first update."""
+    states = ensemble.init_batch(batch, [seed for run in runs for seed in run.seeds])
+    given = [run.init_params for run in runs for _ in run.seeds]
+    if all(params is None for params in given):
+        return states
+    own = states.learner.params
+    drawn = (jax.tree.map(lambda x, i=i: x[i], own) if x is None else x for i, x in enumerate(given))
+    return ensemble.begin_with(states, list(drawn))
 
 
 def _train(states: TrainState, num_updates: int, desk: "_Desk", stop: threading.Event) -> TrainState:

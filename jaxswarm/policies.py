@@ -11,6 +11,7 @@ from jaxswarm import config as configs
 from jaxswarm.checkpoint import restore
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.fit import abstract_state
+from jaxswarm.recording import has_checkpoint
 from jaxswarm.training import Experiment
 
 
@@ -41,6 +42,18 @@ def load(
     trained = configs.run_settings(config).seeds
     policies = read(Path(run_dir), config, which, trained[:1] if seed is None else [seed])
     return policies.experiment, jax.tree.map(lambda x: x[0], policies.params)
+
+
+def to_begin_with(settings: configs.Run, run_dir: Path) -> Any:
+    """The parameters that `init_from` asks for; `None` without it, or where the run folder has a checkpoint.
+
+    Errors are those of `load`.
+    """
+    if settings.init_from is None or has_checkpoint(run_dir):
+        return None
+    if not (Path(settings.init_from) / "config.yaml").is_file():
+        raise ConfigError(f"init_from = {settings.init_from} is not possible; accepted: a run folder")
+    return load(settings.init_from)[1]
 
 
 def read(

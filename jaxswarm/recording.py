@@ -34,6 +34,7 @@ class Run:
     loggers: tuple[str, ...] = ()  # names in `LOGGERS`, which need a folder
     config: Mapping[str, Any] | None = None  # goes into the folder, and is shown to loggers
     on_evaluation: Callable[[int, Any], None] | None = None  # called with updates done and parameters [seeds, ...]
+    init_params: Any = None  # of the network, that all seeds begin with; None: each draws its own
 
 
 @dataclasses.dataclass
@@ -67,11 +68,16 @@ def locked(run_dir: Path) -> Iterator[None]:
         yield
 
 
+def has_checkpoint(run_dir: Path) -> bool:
+    """Whether there is anything to go on from."""
+    return any(run_dir.glob("checkpoints/[0-9]*"))
+
+
 def begun_and_new(run_dirs: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Folders of runs that go on together; and those that are empty where others have checkpoints."""
-    has_checkpoint = {path: any(path.glob("checkpoints/[0-9]*")) for path in run_dirs}
-    is_empty = {path: not has_checkpoint[path] and not reporting.read_rows(path / "metrics.csv") for path in run_dirs}
-    new = [path for path in run_dirs if is_empty[path] and any(has_checkpoint.values())]
+    has_none = [path for path in run_dirs if not has_checkpoint(path)]
+    is_empty = {path: path in has_none and not reporting.read_rows(path / "metrics.csv") for path in run_dirs}
+    new = [path for path in run_dirs if is_empty[path] and len(has_none) < len(run_dirs)]
     return [path for path in run_dirs if path not in new], new
 
 

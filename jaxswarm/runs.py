@@ -19,7 +19,7 @@ from jaxswarm.curves import Curve
 from jaxswarm.reporting import Row, read_rows
 
 # keys that change neither a world nor a policy: seed, length, checkpoints, and when to look
-NOT_COMPARED = {"eval_every", *(field.name for field in dataclasses.fields(configs.Run))}
+NOT_COMPARED = {"eval_every", *(field.name for field in dataclasses.fields(configs.Run))} - {configs.INIT_FROM}
 
 Fields = dict[str, Any]  # a config by dotted key, without those that are not compared
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxswarm import config as configs
-from jaxswarm import render
+from jaxswarm import policies, render
 from jaxswarm.config import Config
 from jaxswarm.fit import DivergedError, fit_runs
 from jaxswarm.recording import Run, begun_and_new
@@ -41,7 +41,9 @@ class Trial:
         """What `fit_runs` takes."""
         render_every = self.settings.render_every
         show = render.hook(self.run_dir, self.experiment, render_every) if render_every else None
-        return Run(self.experiment, self.settings.seeds, self.run_dir, self.settings.loggers, self.config, show)
+        params = policies.to_begin_with(self.settings, self.run_dir)
+        loggers = self.settings.loggers
+        return Run(self.experiment, self.settings.seeds, self.run_dir, loggers, self.config, show, params)
 
 
 def train(together: Sequence[Trial], progress: bool = True) -> tuple[bool, list[list[Row]]]:

@@ -172,6 +172,29 @@ def test_what_users_registered_has_help(tmp_path, monkeypatch, capsys):
     assert "task.num_evaders: 1\n" in out
 
 
+def test_a_larger_swarm_begins_with_the_policy_of_a_smaller_one(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(finished.parent)
+    words = [*TINY, "task.num_agents=6", "num_updates=1", "init_from=finished", f"run_dir={tmp_path / 'larger'}"]
+    assert train.main(words) == 0
+    assert "(at first " in capsys.readouterr().out
+    params = policies.load(finished)[1]
+    larger = configs.build(configs.load(tmp_path / "larger" / "config.yaml"))
+    start = jaxswarm.init(larger, jax.random.key(5))
+    start = start.replace(learner=start.learner.replace(params=params))
+    first = reporting.read_rows(tmp_path / "larger" / "metrics.csv")[0]
+    assert first["eval/return"] == pytest.approx(float(jaxswarm.evaluate(larger, start)["eval/return"]), abs=1e-4)
+    monkeypatch.chdir(tmp_path)
+    moved = finished.rename(tmp_path / "moved")
+    assert train.main([f"resume={tmp_path / 'larger'}", "num_updates=2"]) == 0  # without the folder it began with
+    moved.rename(finished)
+    capsys.readouterr()
+    assert train.main([*TINY, "init_from=nowhere", "run_dir=other"]) == 2
+    assert "nowhere is not possible; accepted: a run folder" in capsys.readouterr().err
+    assert train.main([*TINY, "network.encoder=[5]", f"init_from={finished}", "run_dir=other"]) == 2
+    assert "parameters of other shapes" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
 def test_programs_take_folders_with_any_name(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     folder = tmp_path / "a=b c"

@@ -165,6 +165,7 @@ def test_run_settings_are_the_keys_beside_the_experiment():
         "keep_checkpoints": 3,
         "render_every": None,
         "loggers": (),
+        "init_from": None,
         "imports": (),
     }
 

@@ -138,6 +138,23 @@ def test_a_run_folder_without_a_config_is_announced(tmp_path):
         fit(EXPERIMENT.replace(network=Own((4,), (4,))), 1, run_dir=tmp_path / "run", progress=False)
 
 
+def test_training_begins_with_a_policy_if_there_is_one(undisturbed):
+    params = undisturbed[0].learner.params
+    _, rows = fit(EXPERIMENT, 1, seed=9, num_seeds=2, init_params=params, **OPTIONS)
+    for seed, row in zip((9, 10), rows[:2], strict=True):
+        start = jaxswarm.init(EXPERIMENT, jax.random.key(seed))
+        start = start.replace(learner=start.learner.replace(params=params))
+        assert row["eval/return"] == pytest.approx(float(jaxswarm.evaluate(EXPERIMENT, start)["eval/return"]), abs=1e-5)
+    assert len({row["eval/return"] for row in rows}) == 4
+
+
+def test_a_policy_of_another_network_is_nothing_to_begin_with(undisturbed, tmp_path):
+    other = EXPERIMENT.replace(network=jaxswarm.ActorCritic((5,), (4,)))
+    with pytest.raises(ConfigError, match="parameters of other shapes; accepted: one of the same network"):
+        fit(other, 1, init_params=undisturbed[0].learner.params, run_dir=tmp_path / "run", **OPTIONS)
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_last_row_evaluates_the_final_policy(undisturbed):
     state, rows, _ = undisturbed
     expected = jaxswarm.evaluate(EXPERIMENT, state)

@@ -38,6 +38,7 @@ examples
   jaxswarm-train aggregator=bayesian learner.learning_rate=3e-4 task.num_agents=10 seed=3
   jaxswarm-train experiment=rendezvous_thesis run_dir=runs/thesis
   jaxswarm-train task=pursuit num_seeds=16
+  jaxswarm-train init_from=runs/small task.num_agents=50
   jaxswarm-train resume=runs/thesis num_updates=320
 """
 
@@ -85,11 +86,12 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     run, experiment = configs.run_settings(config), configs.build(config)
     num_updates = run.length(experiment.agent_steps_per_update)
     use_compile_cache()
-    from jaxswarm import ensemble, render  # noqa: PLC0415
+    from jaxswarm import ensemble, policies, render  # noqa: PLC0415
     from jaxswarm.checkpoint import CheckpointError  # noqa: PLC0415
     from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
 
     ensemble.use_cores(run.num_seeds)
+    params = policies.to_begin_with(run, run_dir)
     print(_summary(config, experiment, num_updates, run_dir), flush=True)
     try:
         train_state, rows = fit(
@@ -104,6 +106,7 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
             log_to=run.loggers,
             config=config,
             on_evaluation=render.hook(run_dir, experiment, run.render_every) if run.render_every else None,
+            init_params=params,
         )
     except (DivergedError, CheckpointError) as error:
         print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
@@ -113,12 +116,12 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
         print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
         return 0
     if is_first:
-        policies = load_policies(run_dir, config, "last", run.seeds[:1])
-        assert policies
-        render.write_replay(run_dir, experiment, render.of_seed(policies.params, 0), update=update)
+        found = load_policies(run_dir, config, "last", run.seeds[:1])
+        assert found
+        render.write_replay(run_dir, experiment, render.of_seed(found.params, 0), update=update)
     if rows:
         first, last = (_return_at(rows, rows[index]["update"]) for index in (0, -1))
-        print(f"done: {update} updates, return {last} (untrained {first})")
+        print(f"done: {update} updates, return {last} ({'at first' if run.init_from else 'untrained'} {first})")
     print(f"{_files(run_dir)}\nnext: {command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
     return 0
 
