@@ -1,11 +1,11 @@
-"""Steps per second of every task with random actions, observations included; prints one JSON object per line.
+"""Steps per second of swarms of points with random actions, observations included; prints one JSON object per line.
 
     python benchmarks/environment_throughput.py [worlds=1,64] [agents=10,50] [tasks=pursuit] [repeats=3] [out=FILE]
 
 `environment_steps_per_second` are steps of single worlds, `agent_steps_per_second` those times the agents. Each step is
 followed by the observation of all agents, of which every number is used. Finished episodes restart from a few start
 states. For pursuit, with one and with five evaders, `evasion_over_observation` is the time of the evaders' rule over
-that of the observation of the same worlds.
+that of the observation of the same worlds. Boxes have a benchmark of their own, box_physics.py.
 """
 
 import itertools

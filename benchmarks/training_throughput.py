@@ -1,22 +1,31 @@
 """How fast a training setting compiles, steps and learns; prints one JSON object.
 
-    python benchmarks/training_throughput.py [group=choice | key=value ...] [repeats=3] [out=FILE]
+    python benchmarks/training_throughput.py [group=choice | key=value] ... [repeats=3] [threshold=X seeds=8] [out=FILE]
 
 takes the words of `jaxswarm-train`, for instance `experiment=rendezvous_thesis aggregator=bayesian`. `gemm_fraction` is
 the useful matrix-multiply FLOP/s of the update over those of a 2048 x 2048 float32 matrix product timed in the same
 process: recomputed activations and everything that is no matrix product count for nothing.
+
+With a threshold it also trains several seeds side by side, as `jaxswarm-train` does, to the end of the setting:
+`seconds_to_threshold` are those after which the median seed had a return there, compiling included, of those seeds that
+reached it.
 """
 
+import multiprocessing
 import statistics
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 import jax
+import numpy as np
 from timing import gemm_flops, peak_memory, report, seconds
 
-from jaxswarm import config, ensemble, init, rollout, train
+from jaxswarm import config, curves, ensemble, init, rollout, train
 from jaxswarm.cli.words import split
+from jaxswarm.fit import fit
+from jaxswarm.reporting import RETURN
 from jaxswarm.training import Experiment, evaluate
 
 
@@ -40,8 +49,21 @@ def useful_flops(experiment: Experiment, params: dict) -> int:
     return total
 
 
+def time_to_return(words: list[str], threshold: float, num_seeds: int) -> dict[str, float]:
+    """Trains the seeds, in a process of its own: each core is a device there."""
+    ensemble.use_cores(num_seeds)
+    settings = config.compose(words)
+    experiment = config.build(settings)
+    num_updates = config.run_settings(settings).length(experiment.agent_steps_per_update)
+    _, rows = fit(experiment, num_updates, num_seeds=num_seeds, progress=False)
+    of_seeds = list(curves.from_rows(rows, "wall_seconds", RETURN)[0].values())
+    times, is_reached = curves.times_to(of_seeds, threshold)
+    found = {"num_seeds": num_seeds, "num_reached": int(is_reached.sum()), "seconds": rows[-1]["wall_seconds"]}
+    return found | ({"seconds_to_threshold": float(np.median(times[is_reached]))} if is_reached.any() else {})
+
+
 def main(words: list[str]) -> None:
-    options, words = split(words, ("repeats", "out"))
+    options, words = split(words, ("repeats", "threshold", "seeds", "out"))
     repeats = int(options.get("repeats", 3))
     experiment = config.build(config.compose(words))
     state = jax.jit(init)(experiment, jax.random.key(0))
@@ -89,6 +111,11 @@ def main(words: list[str]) -> None:
         "gemm_gflops": gemm / 1e9,
         "gemm_fraction": flops / gemm,
     }
+    if "threshold" in options:
+        threshold, num_seeds = float(options["threshold"]), int(options.get("seeds", 8))
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            found = pool.submit(time_to_return, words, threshold, num_seeds).result()
+        result["to_return"] = {"threshold": threshold, **found}
     report(result, options.get("out", ""))
 
 

@@ -17,7 +17,7 @@ WORDS = {
     "environment_throughput": ["worlds=1", "agents=3", "repeats=1"],
     "projections": ["rows=8", "repeats=1"],
     "seeds": ["seeds=1,2", "updates=1", *TINY],
-    "training_throughput": ["repeats=1", *TINY],
+    "training_throughput": ["repeats=1", "threshold=-9999", "seeds=2", "num_updates=2", *TINY],
 }
 
 
@@ -46,4 +46,6 @@ def test_benchmark_prints_possible_figures(name):
     assert rows
     for row in rows:
         assert numbers(row)
+        found = row.pop("to_return", None)
         assert all(math.isfinite(x) and x >= 0 for x in numbers(row)), row
+        assert found is None or 0 <= found["seconds_to_threshold"] < found["seconds"]
