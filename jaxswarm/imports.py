@@ -9,7 +9,6 @@ from typing import Any
 
 from jaxswarm.schema import ConfigError
 
-KEPT = "imports"  # folder in a run folder
 have_run: set[str] = set()  # once in a process
 
 
@@ -45,19 +44,23 @@ def place(cls: type) -> str | None:
 
 def keep(places: Sequence[str], run_dir: Path) -> None:
     """Copies files into the run folder, for where the folder is taken without them."""
-    for place in places:
+    for place, copy in zip(places, _copies(places, run_dir), strict=True):
         if place.endswith(".py") and Path(place).exists():
-            (run_dir / KEPT).mkdir(exist_ok=True)
-            shutil.copyfile(place, run_dir / KEPT / Path(place).name)
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copyfile(place, copy)
 
 
 def found(places: Sequence[str], run_dir: Path) -> list[str]:
     """The places, with what the run folder has kept of files that are no longer there."""
-    kept = [run_dir / KEPT / Path(place).name for place in places]
     return [
         str(copy) if place.endswith(".py") and not Path(place).exists() and copy.exists() else place
-        for place, copy in zip(places, kept, strict=True)
+        for place, copy in zip(places, _copies(places, run_dir), strict=True)
     ]
+
+
+def _copies(places: Sequence[str], run_dir: Path) -> list[Path]:
+    """Where copies are; files may have the same name."""
+    return [run_dir / "imports" / f"{number}-{Path(place).name}" for number, place in enumerate(places)]
 
 
 def _run(place: str) -> None:

@@ -95,9 +95,10 @@ def check_folder(run: Run, resume: bool) -> None:
             f"{run.run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "
             "accepted: a folder with both, or another one to train it again"
         )
-    others = {int(row["seed"]) for row in rows} - set(run.seeds)
-    changed = {"seeds": (sorted(others), list(run.seeds))} if others else _changes(run)
-    for name, (before, now) in changed.items():
+    seeds = sorted({int(row["seed"]) for row in rows})
+    changed = _changes(run) if set(seeds) <= set(run.seeds) else {"seeds": (seeds, list(run.seeds))}
+    if changed:
+        name, (before, now) = next(iter(changed.items()))
         raise FileExistsError(f"{run.run_dir} holds a run with {name} = {before}, not {now}; accepted: the same run")
 
 

@@ -244,7 +244,8 @@ def test_files_import_what_is_beside_them_and_modules_what_is_here(registries, t
 def test_a_run_folder_keeps_the_files_that_it_needs(registries, tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     (tmp_path / "mine.py").write_text(OWN)
-    config = configs.compose([f"imports={tmp_path / 'mine.py'}", "task=costly"])
+    (tmp_path / "run" / "mine.py").write_text("")  # another one of that name
+    config = configs.compose([f"imports=[{tmp_path / 'mine.py'},{tmp_path / 'run' / 'mine.py'}]", "task=costly"])
     imports.keep(config["imports"], tmp_path / "run")
     (tmp_path / "run" / "config.yaml").write_text(configs.dump(config))
     (tmp_path / "mine.py").unlink()
