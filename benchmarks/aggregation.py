@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from timing import report, settings
 
-from jaxswarm import AGGREGATORS, sets
+from jaxswarm import AGGREGATORS, ensemble, sets
 from jaxswarm.networks import Beside, Encoder
 from jaxswarm.types import Entities
 
@@ -52,9 +52,13 @@ def programs(name, layout, rows, slots, width):
     group = Entities(jax.random.normal(keys[0], (rows, slots, DIM)), jnp.ones((rows, slots), bool))
     own = jax.random.normal(keys[1], (rows, OWN))
     params = jax.jit(model.init)(keys[2], own[:1], jax.tree.map(lambda x: x[:1], group))
-    forward = jax.jit(lambda p, o, g: model.apply(p, o, g).sum()).lower(params, own, group).compile()
+    forward = (
+        jax.jit(lambda p, o, g: model.apply(p, o, g).sum())
+        .lower(params, own, group)
+        .compile(ensemble.compiler_options())
+    )
     gradient = jax.jit(jax.value_and_grad(lambda p, o, g: model.apply(p, o, g).sum()))
-    gradient = gradient.lower(params, own, group).compile()
+    gradient = gradient.lower(params, own, group).compile(ensemble.compiler_options())
     return {"forward": lambda: forward(params, own, group), "gradient": lambda: gradient(params, own, group)}
 
 
