@@ -18,7 +18,7 @@ import numpy as np
 from timing import peak_memory, report
 
 from jaxswarm import config, ensemble
-from jaxswarm.cli.words import split, use_compile_cache, use_cores
+from jaxswarm.cli.words import split, use_compile_cache
 
 
 def measure(num_seeds, num_updates, words):
@@ -53,7 +53,7 @@ def main(words):
         ensemble.CPU_WIDTH = int(options["width"])
     if "only" in options:
         use_compile_cache()
-        use_cores(int(options["only"]))
+        ensemble.use_cores(int(options["only"]))
         print(json.dumps(measure(int(options["only"]), num_updates, words) | {"width": ensemble.CPU_WIDTH}))
         return
     of_one = None
