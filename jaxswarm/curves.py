@@ -98,7 +98,7 @@ def summarize(curves: Sequence[Curve], statistic: str, best_share: float = 1.0) 
 def redrawn(
     curves: Sequence[Curve], statistic: str, count: int, generator: np.random.Generator, best_share: float = 1.0
 ) -> list[Line]:
-    """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of those not drawn."""
+    """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of all seeds."""
     grid, values = on_common_grid(curves)
     of_all = STATISTICS[statistic].compute(_best(values, best_share))
     lines = []

@@ -244,9 +244,12 @@ def _memory(program: Any) -> int:
 
 def _allotted(folder: Path = Path("/sys/fs/cgroup")) -> float:
     """Bytes that a container may still take; infinite without a limit. Files are dropped from memory where needed."""
-    for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+    places = (
+        (folder, "memory.max", "memory.current"),
+        (folder / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),  # of cgroups of version 1
+    )
+    for place, limit, used in places:
         with contextlib.suppress(OSError, ValueError):  # no such limit, or "max"
-            place = folder if limit == "memory.max" else folder / "memory"
             stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
             files = int(stat.get("inactive_file", stat.get("total_inactive_file", 0)))
             return float(int((place / limit).read_text()) - int((place / used).read_text()) + files)

@@ -7,7 +7,6 @@ bit by bit, however often a run was stopped and resumed. Several seeds, and seve
 """
 
 import contextlib
-import dataclasses
 import math
 import os
 import signal
@@ -89,19 +88,20 @@ def fit(
     restored, `FileExistsError` for a folder that holds another run, or evaluations without checkpoints, and
     `config.ConfigError` for settings that are not possible.
     """
-    settings = configs.Run(
-        seed=seed,
-        num_seeds=1 if num_seeds is None else num_seeds,
-        num_updates=num_updates,
-        checkpoint_seconds=checkpoint_seconds,
-        keep_checkpoints=keep_checkpoints,
-    )
+    given: dict[str, Any] = {
+        "seed": seed,
+        "num_seeds": 1 if num_seeds is None else num_seeds,
+        "num_updates": num_updates,
+        "checkpoint_seconds": checkpoint_seconds,
+        "keep_checkpoints": keep_checkpoints,
+    }
+    seeds = configs.Run(**given).seeds
     if config is None and run_dir is not None:
-        config = configs.describe(experiment, **dataclasses.asdict(settings) | {"loggers": log_to})
+        config = configs.describe(experiment, **given, loggers=log_to)
         if config is None:
             warnings.warn(f"{run_dir} gets no config, so that only `fit` reads it; see `config.describe`", stacklevel=2)
     folder = None if run_dir is None else Path(run_dir)
-    run = Run(experiment, settings.seeds, folder, log_to, config, on_evaluation, init_params)
+    run = Run(experiment, seeds, folder, log_to, config, on_evaluation, init_params)
     states, (rows,) = fit_runs(
         [run],
         num_updates,

@@ -11,6 +11,7 @@ import jaxswarm
 from jaxswarm import AGGREGATORS, TASKS, imports
 from jaxswarm import config as configs
 from jaxswarm.config import ConfigError
+from jaxswarm.fit import fit
 
 
 @pytest.mark.parametrize(
@@ -253,6 +254,16 @@ def test_a_run_folder_keeps_the_files_that_it_needs(registries, tmp_path, monkey
     monkeypatch.setattr(imports, "have_run", set())
     assert configs.load(tmp_path / "run" / "config.yaml") == config
     assert configs.build(config).task.price == 0.5
+
+
+@pytest.mark.slow
+def test_run_folders_of_fit_name_the_files_of_a_users_task(registries, tmp_path):
+    (tmp_path / "mine.py").write_text(OWN)
+    words = [f"imports={tmp_path / 'mine.py'}", "task=costly", "num_agents=3", "task.episode_length=5", "num_worlds=2"]
+    experiment = configs.build(configs.compose([*words, "num_steps=4", "learner.batch_size=12", "eval_worlds=2"]))
+    fit(experiment, 1, run_dir=tmp_path / "run", progress=False)
+    assert configs.read(tmp_path / "run" / "config.yaml")["imports"] == [str(tmp_path / "mine.py")]
+    assert [path.name for path in (tmp_path / "run" / "imports").iterdir()] == ["0-mine.py"]
 
 
 def test_presets_are_experiments_in_python_too():
