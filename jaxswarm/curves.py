@@ -4,11 +4,13 @@ Seeds are evaluated at points of their own, and some end before others. Between 
 linearly, outside of them it is not counted, so that the number of seeds behind a point may differ along a line.
 """
 
+import csv
 import dataclasses
 import math
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 MAX_POINTS = 1000  # of a line; more are thinned out evenly
 NUM_RESAMPLES = 2000
 CONFIDENCE = 0.95
+COLUMNS = ("series", "agent_steps", "median", "q25", "q75")  # of files with lines to compare with
 
 Values = Float[np.ndarray, "seeds points"]
 Points = Float[np.ndarray, " points"]
@@ -68,6 +71,29 @@ def from_rows(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> tuple[dict[i
             at, last = np.unique(mine[is_finite, 0][::-1], return_index=True)
             curves[seed] = Curve(at, mine[is_finite, 1][::-1][last])
     return curves, int(num_left_out)
+
+
+def read_lines(path: Path) -> dict[str, Line]:
+    """The lines of a CSV file by their names; numbers of runs are in a column `n_runs`, or not known: 0.
+
+    A `ValueError` says what is wrong in the file.
+    """
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except csv.Error as error:
+        raise ValueError(str(error)) from error
+    missing = [name for name in COLUMNS if not rows or name not in rows[0]]
+    if missing:
+        raise ValueError(f"it has no column {missing[0]}; it needs {', '.join(COLUMNS)}")
+    lines = {}
+    for name in dict.fromkeys(row["series"] for row in rows):
+        mine = [row for row in rows if row["series"] == name]
+        x, middle, lower, upper = np.array([[float(row[column] or "nan") for column in COLUMNS[1:]] for row in mine]).T
+        if not np.isfinite(x).all():
+            raise ValueError(f"agent_steps of {name!r} are not all numbers")
+        lines[name] = Line(x, middle, lower, upper, np.array([int(row.get("n_runs") or 0) for row in mine]))
+    return lines
 
 
 def trailing_mean(curve: Curve, size: int) -> Curve:

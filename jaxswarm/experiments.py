@@ -4,7 +4,6 @@ A figure is a file in `configs/figure`: its series as words for `jaxswarm-train`
 same experiment share a run folder, whichever figures they are in.
 """
 
-import csv
 import dataclasses
 import hashlib
 import json
@@ -84,7 +83,7 @@ def load(name: str) -> Figure:
     fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
     fields["y"] = tuple(fields.pop("y", ["linear"]))
     fields["best_share"] = float(fields.pop("best_share", 1.0))
-    lines = _references(CURVES / f"{reference}.csv") if reference else {}
+    lines = curves.read_lines(CURVES / f"{reference}.csv") if reference else {}
     references = {own: lines[theirs] for own, theirs in thesis.items() if lines}
     return Figure(name=name, references=references, thesis=thesis, **fields)
 
@@ -215,18 +214,6 @@ def _manifest(folder: RunFolder) -> dict[str, Any]:
 
 def _claim(says: str, kind: str, series: Sequence[str], **numbers: int | float) -> Claim:
     return Claim(says, kind, tuple(series), **{name: float(x) for name, x in numbers.items()})
-
-
-def _references(path: Path) -> dict[str, Line]:
-    with open(path, encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    lines = {}
-    for name in dict.fromkeys(row["series"] for row in rows):
-        columns = ("n_runs", "agent_steps", "median", "q25", "q75")
-        mine = [[float(row[column] or "nan") for column in columns] for row in rows if row["series"] == name]
-        num_runs, x, middle, lower, upper = np.array(mine).T
-        lines[name] = Line(x, middle, lower, upper, num_runs.astype(int))
-    return lines
 
 
 def _cut(figure: Figure, words: Sequence[str], num_seeds: int, scale: float) -> Config:

@@ -197,7 +197,7 @@ def test_references_are_drawn_with_their_source(runs, reference):
         (["reference={reference}", "series=C"], ["series = 'C'", "A (small), B"]),
         (["reference={reference}", "x=update"], ["kind=curve and x=agent_steps"]),
         (["series=C"], ["accepted with reference"]),
-        (["reference={runs}/mean/metrics.csv"], ["has no column series"]),
+        (["reference={runs}/mean/metrics.csv"], ["it has no column series"]),
         (["out=figure.png"], ["would replace figure.csv"]),
     ],
 )

@@ -1,6 +1,5 @@
 """The program `jaxswarm-plot`."""
 
-import csv
 import dataclasses
 import difflib
 import math
@@ -14,7 +13,7 @@ from jaxswarm import curves, plots, runs
 from jaxswarm.checkpoint import replace_text
 from jaxswarm.cli.words import program, split, wants_help, whole
 from jaxswarm.config import ConfigError
-from jaxswarm.curves import STATISTICS, Curve, Line
+from jaxswarm.curves import STATISTICS, Curve
 from jaxswarm.plots import Picture, Series
 from jaxswarm.runs import RunFolder
 
@@ -43,7 +42,6 @@ examples
   jaxswarm-plot runs/a runs/b out=figure.pdf statistic=iqm log=x
   jaxswarm-plot runs kind=threshold threshold=-30 x=wall_seconds
 """
-REFERENCE_COLUMNS = ("series", "agent_steps", "median", "q25", "q75")
 NAMES = {"eval/return": "return of an episode"}
 UNITS = {"agent_steps": "agent steps", "wall_seconds": "seconds", "update": "updates"}
 
@@ -95,7 +93,8 @@ def main(arguments: Sequence[str]) -> int:
         return 0 if arguments else 2
     options, paths = _parse(arguments)
     out = _output(options.out)
-    references = [series for name in options.reference.split(",") if name for series in _reference(Path(name), options)]
+    files = filter(None, options.reference.split(","))
+    references = [series for file in files for series in _references(Path(file), options)]
     groups = _groups([runs.read(path) for path in runs.find(paths)], options)
     title = options.title or (_shared_name(groups) if len(groups) > 1 else "")
     picture = KINDS[options.kind](_seeds(groups, options), options)
@@ -140,36 +139,19 @@ def _output(out: str) -> Path:
     return path
 
 
-def _reference(path: Path, options: Options) -> list[Series]:
+def _references(path: Path, options: Options) -> list[Series]:
     """The curves of a CSV file; the legend says which file they come from and of how many runs they are."""
     try:
-        with open(path, encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+        lines = curves.read_lines(path)
     except OSError as error:
         raise ConfigError(f"cannot read reference={path}: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except ValueError as error:
         raise ConfigError(f"cannot read reference={path}: {error}") from error
-    missing = [name for name in REFERENCE_COLUMNS if not rows or name not in rows[0]]
-    if missing:
-        raise ConfigError(f"reference={path} has no column {missing[0]}; it needs {', '.join(REFERENCE_COLUMNS)}")
-    names = list(dict.fromkeys(row["series"] for row in rows))
-    chosen = [name for name in names if options.series.lower() in name.lower()]
+    chosen = {name: line for name, line in lines.items() if options.series.lower() in name.lower()}
     if not chosen:
-        raise ConfigError(f"series = {options.series!r} is not in {path}; accepted: parts of {', '.join(names)}")
-    return [_reference_series(path, name, [row for row in rows if row["series"] == name]) for name in chosen]
-
-
-def _reference_series(path: Path, name: str, rows: Sequence[Mapping[str, str]]) -> Series:
-    try:
-        table = [[float(row[column] or "nan") for column in REFERENCE_COLUMNS[1:]] for row in rows]
-        num_runs = [int(row.get("n_runs") or 0) for row in rows]
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"cannot read reference={path}: {error}") from error
-    source = f"{path.stem}, {num_runs[0]} runs" if num_runs[0] else path.stem
-    x, middle, lower, upper = np.array(table).T
-    if not np.isfinite(x).all():
-        raise ConfigError(f"cannot read reference={path}: agent_steps of {name!r} are not all numbers")
-    return Series(name, Line(x, middle, lower, upper, np.array(num_runs)), source, is_reference=True)
+        raise ConfigError(f"series = {options.series!r} is not in {path}; accepted: parts of {', '.join(lines)}")
+    sources = {name: f"{path.stem}, {line.num_seeds[0]} runs" for name, line in chosen.items() if line.num_seeds[0]}
+    return [Series(name, line, sources.get(name, path.stem), is_reference=True) for name, line in chosen.items()]
 
 
 def _groups(folders: Sequence[RunFolder], options: Options) -> dict[str, list[RunFolder]]:
