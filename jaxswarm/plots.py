@@ -105,6 +105,11 @@ def table(picture: Picture) -> str:
     return buffer.getvalue()
 
 
+def seed_count(number: int) -> str:
+    """So many seeds, in words."""
+    return "1 seed" if number == 1 else f"{number} seeds"
+
+
 def check(picture: Picture) -> None:
     """A `ValueError` for a logarithmic axis that cannot show the values."""
     x, y = _x_values(picture), _y_values(picture)

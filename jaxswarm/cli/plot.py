@@ -184,7 +184,7 @@ def _curve(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
     for label, line in lines.items():
         shown = groups[label] if options.seeds == "true" else ()
         most, last = int(line.num_seeds.max()), int(line.num_seeds[-1])
-        note = _count(most) + (f", {last} at the end" if last < most else "")
+        note = plots.seed_count(most) + (f", {last} at the end" if last < most else "")
         series.append(Series(label, line, note, seeds=shown))
     caption = f"{statistic.name} and {statistic.band} over seeds".capitalize()
     caption += ", and each seed" if options.seeds == "true" else ""
@@ -199,7 +199,7 @@ def _profile(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture
     at = np.unique(np.concatenate(list(finals.values())))
     margin = 0.05 * (np.ptp(at) or abs(at[0]) or 1.0)
     at = np.concatenate([[at[0] - margin], at, [at[-1] + margin]])
-    series = [Series(label, curves.profile(x, at), _count(len(x))) for label, x in finals.items()]
+    series = [Series(label, curves.profile(x, at), plots.seed_count(len(x))) for label, x in finals.items()]
     ends = [curve.x[-1] for seeds in groups.values() for curve in seeds]
     caption = f"Last evaluation of each seed, at {_amount(max(ends), options.x)}"
     caption += f" (the first to end: {_amount(min(ends), options.x)})" if min(ends) < max(ends) else ""
@@ -215,7 +215,7 @@ def _threshold(groups: Mapping[str, Sequence[Curve]], options: Options) -> Pictu
         line = curves.reaching(seeds, threshold)
         half = line.x[line.y >= 0.5]
         when = f"half by {_amount(half[0], options.x)}" if half.size else "fewer than half"
-        note = f"{is_reached.sum()} of {_count(len(seeds))}, {when}"
+        note = f"{is_reached.sum()} of {plots.seed_count(len(seeds))}, {when}"
         series.append(Series(label, line, note, censored=np.sort(times[~is_reached])))
     fraction = f"fraction of seeds that reached {options.threshold}"
     caption = f"{_name(options)}, first evaluation at or above {options.threshold}".capitalize()
@@ -268,10 +268,6 @@ def _shared_name(groups: Mapping[str, Sequence[RunFolder]]) -> str:
 def _name(options: Options) -> str:
     """What `y` is called in words."""
     return NAMES.get(options.y, options.y)
-
-
-def _count(number: int) -> str:
-    return "1 seed" if number == 1 else f"{number} seeds"
 
 
 def _smoothed(caption: str, options: Options) -> str:
