@@ -188,7 +188,8 @@ def verdicts(figure: Figure, measured: Mapping[str, Measured]) -> list[Verdict]:
 
 def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
     """Draws the figure with the curves of the thesis behind ours, and writes the points beside; returns the files."""
-    series = [Series(name, ours.line, plots.seed_count(ours.line.num_seeds.max())) for name, ours in measured.items()]
+    counts = {name: plots.seed_count(int(ours.line.num_seeds.max())) for name, ours in measured.items()}
+    series = [Series(name, ours.line, counts[name]) for name, ours in measured.items()]
     for name, line in figure.references.items():
         source = "thesis" if figure.thesis[name] == name else f"thesis: {figure.thesis[name]}"
         series.append(Series(name, line, f"{source}, {line.num_seeds[0]} runs", is_reference=True))
