@@ -156,7 +156,7 @@ def _draw_lines(axes: "Axes", picture: Picture) -> None:
         color = _tint(COLORS[labels.index(series.label) % len(COLORS)])
         style = {"color": color, "linewidth": 1.4, "linestyle": DASHES[number % len(DASHES)], "zorder": 2}
         _draw_line(axes, series, picture.is_step, 0.12, style)
-    if len(picture.series) == 1 and len(ours[0].line.x) and not picture.is_step:
+    if len(ours) == 1 and not references and len(ours[0].line.x) and not picture.is_step:
         end, text = (ours[0].line.x[-1], ours[0].line.y[-1]), _signed(ours[0].line.y[-1])
         ground = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
         axes.annotate(text, end, (6, 0), textcoords="offset points", va="center", annotation_clip=False, bbox=ground)
