@@ -18,8 +18,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 from timing import report, settings
 
-from jaxswarm import AGGREGATORS, ensemble, sets
-from jaxswarm.networks import Beside, Encoder
+from jaxswarm import AGGREGATORS
+from jaxswarm.aggregators import sets
+from jaxswarm.host import ensemble
+from jaxswarm.networks import Encoder, ParallelEncoders
 from jaxswarm.types import Entities
 
 GRID = {
@@ -39,7 +41,7 @@ class Network(nn.Module):
     @nn.compact
     def __call__(self, own, group):
         is_raw = self.aggregator.num_encoders == 0
-        encoder = Beside(()) if is_raw else Encoder((self.width,), "leaky_relu", self.aggregator.num_parts)
+        encoder = ParallelEncoders(()) if is_raw else Encoder((self.width,), "leaky_relu", self.aggregator.num_parts)
         aggregator = self.aggregator.copy(name="pooling")
         pool = sets.Pool(aggregator, (encoder,), DIM if is_raw else self.width, self.layout)
         return nn.leaky_relu(nn.Dense(self.width)(jnp.concatenate([own, pool((group,), own)], -1)))
@@ -103,8 +105,8 @@ def measure(names, rows, slots, width, repeats):
         }
 
 
-def main(words):
-    given = settings(words, **GRID, repeats="5")
+def main(overrides):
+    given = settings(overrides, **GRID, repeats="5")
     sizes = ([int(x) for x in given[name].split(",")] for name in ("rows", "slots", "features"))
     for size in itertools.product(*sizes):
         for result in measure(given["aggregators"].split(","), *size, int(given["repeats"])):

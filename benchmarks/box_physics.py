@@ -24,11 +24,11 @@ import numpy as np
 from Box2D import b2ChainShape, b2CircleShape, b2FixtureDef, b2PolygonShape, b2World
 from timing import report, settings
 
-from jaxswarm.contacts import MAX_SPEED, MAX_TURN_RATE
+from jaxswarm.physics.contacts import MAX_SPEED, MAX_TURN_RATE
 from jaxswarm.tasks.boxes import Assembly
 
 SCENES = ((10, 4, 1.0), (20, 12, 2.0))
-UNITS = 25  # of Box2D per metre
+UNITS = 25  # of Box2D per meter
 HOLD = 5  # steps for which robots keep their commands
 
 
@@ -110,12 +110,12 @@ def box2d_rate(task: Assembly, is_environment: bool, seconds: float) -> float:
     return steps / (time.process_time() - start)
 
 
-def jaxswarm_rate(task: Assembly, num_worlds: int, is_environment: bool, seconds: float) -> tuple[float, float]:
+def jaxswarm_rate(task: Assembly, num_envs: int, is_environment: bool, seconds: float) -> tuple[float, float]:
     """Environment steps per second of CPU, and seconds to trace and compile."""
 
     @jax.jit
     def advance(states, key):
-        action = jax.random.uniform(key, (num_worlds, task.num_agents, 2), minval=-1)
+        action = jax.random.uniform(key, (num_envs, task.num_agents, 2), minval=-1)
 
         def step(states, _):
             if not is_environment:
@@ -125,7 +125,7 @@ def jaxswarm_rate(task: Assembly, num_worlds: int, is_environment: bool, seconds
 
         return jax.lax.scan(step, states, length=HOLD)
 
-    states = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.key(0), num_worlds))
+    states = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.key(0), num_envs))
     begin = time.perf_counter()
     program = advance.lower(states, jax.random.key(1)).compile()
     compile_seconds = time.perf_counter() - begin
@@ -133,26 +133,26 @@ def jaxswarm_rate(task: Assembly, num_worlds: int, is_environment: bool, seconds
     steps, start = 0, time.process_time()
     while time.process_time() - start < seconds:
         states, _ = jax.block_until_ready(program(states, jax.random.key(steps)))
-        steps += HOLD * num_worlds
+        steps += HOLD * num_envs
     return steps / (time.process_time() - start), compile_seconds
 
 
-def main(words: list[str]) -> None:
-    given = settings(words, worlds="1,64,1024", seconds="2", physics="faithful")
+def main(overrides: list[str]) -> None:
+    given = settings(overrides, worlds="1,64,1024", seconds="2", physics="faithful")
     seconds = float(given["seconds"])
     for (num_agents, num_boxes, side), kind in itertools.product(SCENES, ("physics", "environment")):
         task = Assembly(num_agents=num_agents, num_boxes=num_boxes, side=side, physics=given["physics"])
         is_environment = kind == "environment"
         box2d = box2d_rate(task, is_environment, seconds)
-        for num_worlds in map(int, given["worlds"].split(",")):
-            rate, compile_seconds = jaxswarm_rate(task, num_worlds, is_environment, seconds)
+        for num_envs in map(int, given["worlds"].split(",")):
+            rate, compile_seconds = jaxswarm_rate(task, num_envs, is_environment, seconds)
             row = {
                 "benchmark": "box_physics",
                 "kind": kind,
                 "robots": num_agents,
                 "boxes": num_boxes,
                 "physics": given["physics"],
-                "worlds": num_worlds,
+                "worlds": num_envs,
                 "steps_per_cpu_second": rate,
                 "box2d_steps_per_cpu_second": box2d,
                 "ratio": rate / box2d,

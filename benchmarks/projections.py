@@ -18,7 +18,7 @@ from timing import report, settings
 
 from jaxswarm import LEARNERS, config
 from jaxswarm.distributions import gaussian
-from jaxswarm.learners.on_policy import Batch
+from jaxswarm.learners.on_policy import Minibatch
 from jaxswarm.learners.projections import PROJECTIONS
 from jaxswarm.types import Observation
 
@@ -49,7 +49,7 @@ def microseconds(functions: dict, repeats: int) -> dict[str, float]:
     return {name: 1e6 * float(np.median(x)) for name, x in times.items()}
 
 
-def changed(num_rows: int, dim: int, is_shared: bool) -> tuple[dict, dict, Batch]:
+def changed(num_rows: int, dim: int, is_shared: bool) -> tuple[dict, dict, Minibatch]:
     """Outputs, old outputs, and a batch that the old ones took; nearly all rows are outside the bounds."""
     keys = jax.random.split(jax.random.key(0), 7)
     stds = (1 if is_shared else num_rows, dim)
@@ -63,7 +63,7 @@ def changed(num_rows: int, dim: int, is_shared: bool) -> tuple[dict, dict, Batch
     action = policy.sample(seed=keys[4])
     advantage, target = jax.random.normal(keys[5], (2, num_rows))
     obs = Observation(jnp.zeros((num_rows, 0)), {})
-    return new, old, Batch(obs, action, policy.log_prob(action), advantage, target, policy.mean(), policy.stddev())
+    return new, old, Minibatch(obs, action, policy.log_prob(action), advantage, target, policy.mean(), policy.stddev())
 
 
 def calls(num_rows: int, dim: int) -> dict:
@@ -80,7 +80,7 @@ def calls(num_rows: int, dim: int) -> dict:
     return {"log_prob": (log_prob, (new,))} | functions
 
 
-def losses(network, params: dict, batch: Batch) -> dict:
+def losses(network, params: dict, batch: Minibatch) -> dict:
     """Loss and gradient of PPO, and of TRL with every projection."""
 
     def function(learner, *more):
@@ -103,8 +103,8 @@ def on_rendezvous(num_rows: int, std: str) -> tuple:
     return network, params, batch.replace(obs=obs)
 
 
-def main(words: list[str]) -> None:
-    given = settings(words, rows="4096", repeats="200")
+def main(overrides: list[str]) -> None:
+    given = settings(overrides, rows="4096", repeats="200")
     num_rows, repeats = int(given["rows"]), int(given["repeats"])
     cases = [({"benchmark": "call", "dim": dim}, lambda dim=dim: calls(num_rows, dim)) for dim in (2, 8)]
     for std in ("shared", "state"):

@@ -15,15 +15,16 @@ import time
 
 import jax
 import numpy as np
+from jaxswarm.cli.overrides import split, use_compile_cache
 from timing import peak_memory, report
 
-from jaxswarm import config, ensemble
-from jaxswarm.cli.words import split, use_compile_cache
+from jaxswarm import config
+from jaxswarm.host import ensemble
 
 
-def measure(num_seeds, num_updates, words):
+def measure(num_seeds, num_updates, overrides):
     """Seconds per update of all seeds, and of compiling."""
-    experiment = config.build(config.compose(words))
+    experiment = config.build(config.compose(overrides))
     batch = ensemble.make_batch([experiment], num_seeds)
     states = ensemble.init_batch(batch, range(num_seeds))
     start, best = time.perf_counter(), float("inf")
@@ -46,22 +47,22 @@ def measure(num_seeds, num_updates, words):
     }
 
 
-def main(words):
-    options, words = split(words, ("seeds", "width", "updates", "out", "only"))
+def main(overrides):
+    options, overrides = split(overrides, ("seeds", "width", "updates", "out", "only"))
     num_updates = int(options.get("updates", 3))
     if "width" in options:
         ensemble.CPU_WIDTH = int(options["width"])
     if "only" in options:
         use_compile_cache()
         ensemble.use_cores(int(options["only"]))
-        print(json.dumps(measure(int(options["only"]), num_updates, words) | {"width": ensemble.CPU_WIDTH}))
+        print(json.dumps(measure(int(options["only"]), num_updates, overrides) | {"width": ensemble.CPU_WIDTH}))
         return
     of_one = None
     for num_seeds in options.get("seeds", "1,4,16,64").split(","):
         given = [f"{name}={options[name]}" for name in ("width", "updates") if name in options]
-        command = [sys.executable, __file__, f"only={num_seeds}", *given, *words]
+        command = [sys.executable, __file__, f"only={num_seeds}", *given, *overrides]
         output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        result = {"benchmark": "seeds", "words": words} | json.loads(output.splitlines()[-1])
+        result = {"benchmark": "seeds", "words": overrides} | json.loads(output.splitlines()[-1])
         of_one = of_one or result["seconds_per_update"] / result["num_seeds"]
         result["over_one_seed"] = result["seconds_per_update"] / of_one
         report(result, options.get("out", ""))

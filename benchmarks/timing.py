@@ -7,24 +7,24 @@ import time
 
 import jax
 
-from jaxswarm import reporting
+from jaxswarm.host import manifest
 
 
-def settings(words: list[str], **defaults: str) -> dict[str, str]:
+def settings(overrides: list[str], **defaults: str) -> dict[str, str]:
     """The values of `key=value` words over the defaults; a `ValueError` says which keys there are."""
-    for word in words:
+    for word in overrides:
         key, equals, _ = word.partition("=")
         if not equals or key not in (*defaults, "out"):
             raise ValueError(
                 f"{word} is not possible; accepted: {', '.join(f'{key}=...' for key in (*defaults, 'out'))}"
             )
-    return {"out": ""} | defaults | dict(word.split("=", 1) for word in words)
+    return {"out": ""} | defaults | dict(word.split("=", 1) for word in overrides)
 
 
 def report(result: dict, out: str = "") -> None:
     """Prints the result as a line of JSON, to four digits and with where it was measured, and appends it to a file."""
     rounded = json.loads(json.dumps(result), parse_float=lambda x: float(f"{float(x):.4g}"))
-    line = json.dumps(rounded | reporting.provenance())
+    line = json.dumps(rounded | manifest.provenance())
     print(line, flush=True)
     if out:
         with open(out, "a", encoding="utf-8") as file:

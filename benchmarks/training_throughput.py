@@ -20,12 +20,14 @@ from functools import partial
 
 import jax
 import numpy as np
+from jaxswarm.cli.overrides import split
 from timing import gemm_flops, peak_memory, report, seconds
 
-from jaxswarm import config, curves, ensemble, init, rollout, train
-from jaxswarm.cli.words import split
-from jaxswarm.fit import fit
-from jaxswarm.reporting import RETURN
+from jaxswarm import config, init, rollout, train
+from jaxswarm.analysis import curves
+from jaxswarm.files import RETURN
+from jaxswarm.host import ensemble
+from jaxswarm.host.fit import fit
 from jaxswarm.training import Experiment, evaluate
 
 
@@ -49,10 +51,10 @@ def useful_flops(experiment: Experiment, params: dict) -> int:
     return total
 
 
-def time_to_return(words: list[str], threshold: float, num_seeds: int) -> dict[str, float]:
+def time_to_return(overrides: list[str], threshold: float, num_seeds: int) -> dict[str, float]:
     """Trains the seeds, in a process of its own: each core is a device there."""
     ensemble.use_cores(num_seeds)
-    settings = config.compose(words)
+    settings = config.compose(overrides)
     experiment = config.build(settings)
     num_updates = config.run_settings(settings).length(experiment.agent_steps_per_update)
     _, rows = fit(experiment, num_updates, num_seeds=num_seeds, progress=False)
@@ -62,10 +64,10 @@ def time_to_return(words: list[str], threshold: float, num_seeds: int) -> dict[s
     return found | ({"seconds_to_threshold": float(np.median(times[is_reached]))} if is_reached.any() else {})
 
 
-def main(words: list[str]) -> None:
-    options, words = split(words, ("repeats", "threshold", "seeds", "out"))
+def main(overrides: list[str]) -> None:
+    options, overrides = split(overrides, ("repeats", "threshold", "seeds", "out"))
     repeats = int(options.get("repeats", 3))
-    experiment = config.build(config.compose(words))
+    experiment = config.build(config.compose(overrides))
     state = jax.jit(init)(experiment, jax.random.key(0))
 
     start = time.perf_counter()
@@ -79,7 +81,7 @@ def main(words: list[str]) -> None:
     def collect(state):
         policy = partial(experiment.network.apply, state.learner.params, method="policy")
         sizes = experiment.num_steps, experiment.num_start_states
-        return rollout.collect(jax.random.key(1), experiment.task, policy, state.worlds, *sizes)
+        return rollout.collect(jax.random.key(1), experiment.task, policy, state.envs, *sizes)
 
     @partial(jax.jit, compiler_options=ensemble.compiler_options())
     def update(state, trajectory):
@@ -98,7 +100,7 @@ def main(words: list[str]) -> None:
     flops = useful_flops(experiment, state.learner.params) * steps * experiment.learner.num_epochs / update_seconds
     result = {
         "benchmark": "training_throughput",
-        "setting": words,
+        "setting": overrides,
         "agent_steps_per_update": steps,
         "trace_seconds": trace_seconds,
         "compile_seconds": compile_seconds,
@@ -114,7 +116,7 @@ def main(words: list[str]) -> None:
     if "threshold" in options:
         threshold, num_seeds = float(options["threshold"]), int(options.get("seeds", 8))
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            found = pool.submit(time_to_return, words, threshold, num_seeds).result()
+            found = pool.submit(time_to_return, overrides, threshold, num_seeds).result()
         result["to_return"] = {"threshold": threshold, **found}
     report(result, options.get("out", ""))
 

@@ -6,9 +6,10 @@ from etils import epy
 
 with epy.lazy_api_imports(globals()):  # the command line answers before JAX is there
     from jaxswarm.aggregators import AGGREGATORS
+    from jaxswarm.host.fit import fit
+    from jaxswarm.host.trained import load
     from jaxswarm.learners import LEARNERS
     from jaxswarm.networks import ActorCritic
-    from jaxswarm.policies import load
     from jaxswarm.tasks import TASKS
     from jaxswarm.training import Experiment, TrainState, evaluate, init, train
 
@@ -23,6 +24,7 @@ __all__ = [
     "TrainState",
     "evaluate",
     "experiment",
+    "fit",
     "init",
     "load",
     "make",
@@ -30,14 +32,14 @@ __all__ = [
 ]
 
 
-def experiment(*words: str) -> Any:
+def experiment(*overrides: str) -> Any:
     """The `Experiment` that these words of `jaxswarm-train` ask for; a `ConfigError` says what is wrong with them.
 
     experiment = jaxswarm.experiment("experiment=pursuit_best", "task.num_agents=20")
     """
     from jaxswarm import config  # noqa: PLC0415
 
-    return config.build(config.compose(words))
+    return config.build(config.compose(overrides))
 
 
 def make(name: str, **fields: Any) -> Any:

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from jaxswarm import sets
-from jaxswarm.aggregators import Mean
+from jaxswarm.aggregators import Mean, sets
 from jaxswarm.distributions import Policy, gaussian
-from jaxswarm.types import Entities, Observation, is_flag, is_whole, require
+from jaxswarm.types import Entities, Observation, is_bool, is_integer, require
 
 
 def leaky_relu(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -26,7 +25,7 @@ _HIDDEN_INIT = nn.initializers.orthogonal(math.sqrt(2.0))
 class Encoder(nn.Module):
     """Dense layers, each followed by the activation, the last one unless it `ends_linear`; then any second stage.
 
-    The last layer yields the parts of a message by one matrix product each, initialised as one matrix.
+    The last layer yields the parts of a message by one matrix product each, initialized as one matrix.
     """
 
     widths: tuple[int, ...]
@@ -52,7 +51,7 @@ class Encoder(nn.Module):
         return outputs if self.second_stage is None else self.second_stage(*outputs)
 
 
-class Beside(nn.Module):
+class ParallelEncoders(nn.Module):
     """Encoders of the same entities, one for each part of a message; with none, the features are the message."""
 
     encoders: tuple[nn.Module, ...]
@@ -129,7 +128,10 @@ class Tower(nn.Module):
             return Encoder(widths, self.activation, size, second_stage, ends_linear, name=name)
 
         shared = {n: encoder(self.shared_encoder, f"second_stage{n}") if self.shared_encoder else None for n in numbers}
-        return {m: Beside(tuple(encoder(self.encoder, f"{m}_encoder{n}", shared[n]) for n in numbers)) for m in names}
+        return {
+            m: ParallelEncoders(tuple(encoder(self.encoder, f"{m}_encoder{n}", shared[n]) for n in numbers))
+            for m in names
+        }
 
 
 class ActorCritic(nn.Module):
@@ -140,7 +142,7 @@ class ActorCritic(nn.Module):
     of actions is one parameter, the same in all states, or with `std="state"` a second head of the actor. All layers
     end with the activation, as in the thesis, or with `linear_output_layers` all but the last before an aggregator and
     the last of the decoder.
-    Initialisation: orthogonal with gain sqrt(2) inside, 0.01 for the action mean and for the head of the log standard
+    Initialization: orthogonal with gain sqrt(2) inside, 0.01 for the action mean and for the head of the log standard
     deviation, 1 for the value, shared log standard deviation 0.
     """
 
@@ -163,8 +165,8 @@ class ActorCritic(nn.Module):
         require(self, ", ".join(ACTIVATIONS), lambda x: x in ACTIVATIONS, "activation")
         require(self, "separate, shared", lambda x: x in ("separate", "shared"), "latent_space")
         require(self, "shared, state", lambda x: x in ("shared", "state"), "std")
-        require(self, "True, False", is_flag, "linear_output_layers")
-        require(self, "whole numbers from 1", is_whole(1), "action_dim")
+        require(self, "True, False", is_bool, "linear_output_layers")
+        require(self, "whole numbers from 1", is_integer(1), "action_dim")
         if hasattr(self.aggregator, "check_width"):
             self.aggregator.check_width((*self.encoder, *self.shared_encoder)[-1])
         super().__post_init__()
@@ -206,7 +208,7 @@ class ActorCritic(nn.Module):
 
 
 def _is_widths(value: Any) -> bool:
-    return isinstance(value, tuple) and all(map(is_whole(1), value))
+    return isinstance(value, tuple) and all(map(is_integer(1), value))
 
 
 def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:

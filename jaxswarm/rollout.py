@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.types import Key, Metrics, Observation, Step, pytree
 
-WORLDS_AXIS = "worlds"  # of a mesh of devices
+ENVS_AXIS = "envs"  # of a mesh of devices
 
 PolicyFn = Callable[[Observation], Any]  # to a `distributions.Policy`
 
@@ -24,59 +24,59 @@ class Trajectory:
     """What the learner gets; `final_state` is the state after the step, before any reset."""
 
     state: Any
-    action: Float[Array, "steps worlds agents action_dim"]  # as sampled, not clipped
-    log_prob: Float[Array, "steps worlds agents"]
-    action_mean: Float[Array, "steps worlds agents action_dim"]  # of the policy that acted
-    action_std: Float[Array, "steps worlds agents action_dim"]
-    reward: Float[Array, "steps worlds"]
-    terminated: Bool[Array, "steps worlds"]
-    truncated: Bool[Array, "steps worlds"]
+    action: Float[Array, "steps envs agents action_dim"]  # as sampled, not clipped
+    log_prob: Float[Array, "steps envs agents"]
+    action_mean: Float[Array, "steps envs agents action_dim"]  # of the policy that acted
+    action_std: Float[Array, "steps envs agents action_dim"]
+    reward: Float[Array, "steps envs"]
+    terminated: Bool[Array, "steps envs"]
+    truncated: Bool[Array, "steps envs"]
     final_state: Any
-    mask: Bool[Array, "steps worlds agents"] | None  # agents that exist; None: all do
+    mask: Bool[Array, "steps envs agents"] | None  # agents that exist; None: all do
 
 
 @pytree
-class Worlds:
+class Environments:
     """Worlds in the middle of their episodes, with the sums of the episodes so far."""
 
     state: Any
-    episode_return: Float[Array, " worlds"]
-    episode_length: Int[Array, " worlds"]
-    is_whole: Bool[Array, " worlds"]  # the episode was seen from its start
+    episode_return: Float[Array, " envs"]
+    episode_length: Int[Array, " envs"]
+    is_complete: Bool[Array, " envs"]  # the episode was seen from its start
 
 
-def start(key: Key, task: Any, num_worlds: int, is_desynchronised: bool) -> Worlds:
+def start(key: Key, task: Any, num_envs: int, is_desynchronized: bool) -> Environments:
     """Fresh worlds; desynchronised ones start at a random time of an episode whose return then counts nowhere."""
     reset_key, time_key = jax.random.split(key)
-    state = jax.vmap(task.reset)(jax.random.split(reset_key, num_worlds))
-    if is_desynchronised:
-        state = state.replace(time=jax.random.randint(time_key, (num_worlds,), 0, task.episode_length))
-    is_whole = jnp.full((num_worlds,), not is_desynchronised)
-    return Worlds(state, jnp.zeros(num_worlds), jnp.zeros(num_worlds, jnp.int32), is_whole)
+    state = jax.vmap(task.reset)(jax.random.split(reset_key, num_envs))
+    if is_desynchronized:
+        state = state.replace(time=jax.random.randint(time_key, (num_envs,), 0, task.episode_length))
+    is_complete = jnp.full((num_envs,), not is_desynchronized)
+    return Environments(state, jnp.zeros(num_envs), jnp.zeros(num_envs, jnp.int32), is_complete)
 
 
 def collect(
-    key: Key, task: Any, policy: PolicyFn, worlds: Worlds, num_steps: int, reset_pool: int
-) -> tuple[Worlds, Trajectory, Metrics]:
+    key: Key, task: Any, policy: PolicyFn, envs: Environments, num_steps: int, reset_pool: int
+) -> tuple[Environments, Trajectory, Metrics]:
     """Steps all worlds `num_steps` times with sampled actions; finished ones restart.
 
     Start states are drawn once per call, `reset_pool` for each world; a world that restarts more often within one
     call uses them again. The metrics are means over the episodes that were completed, NaN where there were none.
     """
-    num_worlds = worlds.episode_return.shape[0]
+    num_envs = envs.episode_return.shape[0]
     pool_key, step_key = jax.random.split(key)
-    reset_keys = jax.random.split(pool_key, (reset_pool, num_worlds))
+    reset_keys = jax.random.split(pool_key, (reset_pool, num_envs))
     pool = jax.vmap(jax.vmap(task.reset))(reset_keys)
 
     def step(carry: tuple, key: Key) -> tuple:
-        worlds, num_resets, totals = carry
-        action_key, world_key = jax.random.split(key)
-        obs = jax.vmap(task.observe)(worlds.state)
+        envs, num_resets, totals = carry
+        action_key, env_key = jax.random.split(key)
+        obs = jax.vmap(task.observe)(envs.state)
         distribution = policy(obs)
         action = distribution.sample(seed=action_key)
-        final_state, outcome = _step_worlds(world_key, task, worlds.state, action)
+        final_state, outcome = step_envs(env_key, task, envs.state, action)
         transition = Trajectory(
-            worlds.state,
+            envs.state,
             action,
             distribution.log_prob(action),
             distribution.mean(),
@@ -88,52 +88,52 @@ def collect(
             obs.mask,
         )
         is_done = outcome.terminated | outcome.truncated
-        episode_return = worlds.episode_return + outcome.reward
-        episode_length = worlds.episode_length + 1
-        counts = (is_done & worlds.is_whole).astype(jnp.float32)
+        episode_return = envs.episode_return + outcome.reward
+        episode_length = envs.episode_length + 1
+        counts = (is_done & envs.is_complete).astype(jnp.float32)
         completed = (counts, counts * episode_return, counts * episode_length)
         totals = jax.tree.map(lambda total, x: total + x.sum(), totals, completed)
-        start_state = jax.tree.map(lambda x: x[num_resets % reset_pool, jnp.arange(num_worlds)], pool)
-        worlds = Worlds(
+        start_state = jax.tree.map(lambda x: x[num_resets % reset_pool, jnp.arange(num_envs)], pool)
+        envs = Environments(
             jax.vmap(_select)(is_done, start_state, final_state),
             jnp.where(is_done, 0.0, episode_return),
             jnp.where(is_done, 0, episode_length),
-            worlds.is_whole | is_done,
+            envs.is_complete | is_done,
         )
-        return (worlds, num_resets + is_done, totals), transition
+        return (envs, num_resets + is_done, totals), transition
 
-    carry = (worlds, jnp.zeros(num_worlds, jnp.int32), (jnp.zeros(()),) * 3)
+    carry = (envs, jnp.zeros(num_envs, jnp.int32), (jnp.zeros(()),) * 3)
     carry, trajectory = jax.lax.scan(step, carry, jax.random.split(step_key, num_steps))
-    worlds, _, (episodes, returns, lengths) = carry
+    envs, _, (episodes, returns, lengths) = carry
     metrics = {"episodes": episodes, "return": returns / episodes, "episode_length": lengths / episodes}
-    return worlds, trajectory, metrics
+    return envs, trajectory, metrics
 
 
 def spread_rows(tree: Any) -> Any:
     """The tree with its rows spread over the devices that share worlds, if there are several."""
     mesh = jax.sharding.get_abstract_mesh()
-    num_devices = dict(mesh.shape).get(WORLDS_AXIS, 1)
+    num_devices = dict(mesh.shape).get(ENVS_AXIS, 1)
 
     def spread(x: Array) -> Array:
         is_even = num_devices > 1 and x.shape[0] % num_devices == 0
-        return jax.lax.with_sharding_constraint(x, PartitionSpec(WORLDS_AXIS)) if is_even else x
+        return jax.lax.with_sharding_constraint(x, PartitionSpec(ENVS_AXIS)) if is_even else x
 
     return jax.tree.map(spread, tree)
 
 
-def evaluate(key: Key, task: Any, policy: PolicyFn, num_worlds: int) -> Metrics:
+def evaluate(key: Key, task: Any, policy: PolicyFn, num_envs: int) -> Metrics:
     """One whole episode in each of fresh worlds with the mean action: undiscounted returns and the task's own metrics.
 
     The task's metrics are averaged over the steps of an episode, then over episodes. A metric that is NaN at a step
     says nothing there: only the other steps count, and only episodes that have any.
     """
     reset_key, step_key = jax.random.split(key)
-    start = jax.vmap(task.reset)(jax.random.split(reset_key, num_worlds))
+    start = jax.vmap(task.reset)(jax.random.split(reset_key, num_envs))
 
     def step(carry: tuple, key: Key) -> tuple:
         state, is_running, returns, lengths, totals, counts = carry
         action = policy(jax.vmap(task.observe)(state)).mean()
-        state, outcome = _step_worlds(key, task, state, action)
+        state, outcome = step_envs(key, task, state, action)
         counted = {name: is_running & ~jnp.isnan(x) for name, x in outcome.metrics.items()}
         totals = {name: totals[name] + jnp.where(counted[name], x, 0.0) for name, x in outcome.metrics.items()}
         counts = {name: counts[name] + x for name, x in counted.items()}
@@ -141,17 +141,17 @@ def evaluate(key: Key, task: Any, policy: PolicyFn, num_worlds: int) -> Metrics:
         is_over = outcome.terminated | outcome.truncated
         return (state, is_running & ~is_over, returns, lengths + is_running, totals, counts), None
 
-    action = jnp.zeros((num_worlds, task.num_agents, task.action_dim))
-    names = jax.eval_shape(lambda: _step_worlds(step_key, task, start, action)[1]).metrics
-    zeros = dict.fromkeys(names, jnp.zeros(num_worlds))
-    carry = (start, jnp.ones(num_worlds, bool), jnp.zeros(num_worlds), jnp.zeros(num_worlds), zeros, zeros)
+    action = jnp.zeros((num_envs, task.num_agents, task.action_dim))
+    names = jax.eval_shape(lambda: step_envs(step_key, task, start, action)[1]).metrics
+    zeros = dict.fromkeys(names, jnp.zeros(num_envs))
+    carry = (start, jnp.ones(num_envs, bool), jnp.zeros(num_envs), jnp.zeros(num_envs), zeros, zeros)
     carry, _ = jax.lax.scan(step, carry, jax.random.split(step_key, task.episode_length))
     _, _, returns, lengths, totals, counts = carry
     means = {name: jnp.nanmean(total / counts[name]) for name, total in totals.items()}
     return {"return": returns.mean(), "return_std": returns.std(), "episode_length": lengths.mean()} | means
 
 
-def _step_worlds(key: Key, task: Any, state: Any, action: Float[Array, "worlds agents action_dim"]) -> tuple[Any, Step]:
+def step_envs(key: Key, task: Any, state: Any, action: Float[Array, "envs agents action_dim"]) -> tuple[Any, Step]:
     """One step of every world; actions are clipped to the action box here."""
     keys = jax.random.split(key, action.shape[0])
     return jax.vmap(task.step)(keys, state, jnp.clip(action, -1.0, 1.0))

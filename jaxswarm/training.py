@@ -16,18 +16,18 @@ from jaxtyping import Array, Bool, Int
 from jaxswarm import rollout
 from jaxswarm.learners.on_policy import LearnerState, OnPolicy, batch_size
 from jaxswarm.networks import ActorCritic
-from jaxswarm.rollout import PolicyFn, Worlds
-from jaxswarm.types import Key, Metrics, is_flag, is_whole, pytree, require, static
+from jaxswarm.rollout import Environments, PolicyFn
+from jaxswarm.types import Key, Metrics, is_bool, is_integer, pytree, require, static
 
 MAX_SAMPLES = 2**31 - 1  # of one update: int32 numbers them
 
 
 @pytree
 class Experiment:
-    """All that defines a run but its seed. One update takes `num_steps` steps in each of `num_worlds` worlds.
+    """All that defines a run but its seed. One update takes `num_steps` steps in each of `num_envs` worlds.
 
-    Every `eval_every` updates, before the update, the deterministic policy plays one episode in each of `eval_worlds`
-    separate worlds. With `desynchronised_start` each world begins at a random time of its first episode, so that
+    Every `eval_every` updates, before the update, the deterministic policy plays one episode in each of `num_eval_envs`
+    separate worlds. With `desynchronized_start` each world begins at a random time of its first episode, so that
     worlds do not move in lockstep. `reset_pool` start states are drawn per world and update; `None`: as many as whole
     episodes begin in `num_steps`. Worlds of a task that ends early may need more; they use theirs again.
     """
@@ -35,23 +35,23 @@ class Experiment:
     task: Any
     network: ActorCritic = static()
     learner: Any
-    num_worlds: int = static(default=32)
+    num_envs: int = static(default=32)
     num_steps: int = static(default=128)
-    eval_worlds: int = static(default=20)
+    num_eval_envs: int = static(default=20)
     eval_every: int = static(default=5)
-    desynchronised_start: bool = static(default=True)
+    desynchronized_start: bool = static(default=True)
     reset_pool: int | None = static(default=None)
 
     def __post_init__(self) -> None:
         for name, does in {"task": "reset", "network": "apply", "learner": "update"}.items():
             require(self, f"objects with `{does}`", lambda x, does=does: _has(x, does), name)
-        sizes = ("num_worlds", "num_steps", "eval_worlds", "eval_every")
-        require(self, "whole numbers from 1", is_whole(1), *sizes)
-        require(self, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "reset_pool")
-        require(self, "True, False", is_flag, "desynchronised_start")
+        sizes = ("num_envs", "num_steps", "num_eval_envs", "eval_every")
+        require(self, "whole numbers from 1", is_integer(1), *sizes)
+        require(self, "null, whole numbers from 1", lambda x: x is None or is_integer(1)(x), "reset_pool")
+        require(self, "True, False", is_bool, "desynchronized_start")
         if self.agent_steps_per_update > MAX_SAMPLES:
             raise ValueError(
-                f"num_worlds * num_steps * num_agents = {self.agent_steps_per_update} is not possible; "
+                f"num_envs * num_steps * num_agents = {self.agent_steps_per_update} is not possible; "
                 f"accepted: up to {MAX_SAMPLES}"
             )
         task, network = type(self.task).__name__, self.network
@@ -70,7 +70,7 @@ class Experiment:
     @property
     def agent_steps_per_update(self) -> int:
         """Environment steps of all agents in one update."""
-        return self.num_worlds * self.num_steps * self.task.num_agents
+        return self.num_envs * self.num_steps * self.task.num_agents
 
 
 def _has(part: Any, method: str) -> bool:
@@ -84,18 +84,18 @@ class TrainState:
     update: Int[Array, ""]  # updates done
     key: Key
     learner: LearnerState
-    worlds: Worlds
+    envs: Environments
     is_finite: Bool[Array, ""]  # False: numbers stopped being finite in the update after these, and the state stays
 
 
 @jax.jit
 def init(experiment: Experiment, key: Key) -> TrainState:
     """State before the first update."""
-    run_key, params_key, obs_key, worlds_key = jax.random.split(key, 4)
+    run_key, params_key, obs_key, envs_key = jax.random.split(key, 4)
     obs = experiment.task.observe(experiment.task.reset(obs_key))
     params = experiment.network.init(params_key, obs)
-    worlds = rollout.start(worlds_key, experiment.task, experiment.num_worlds, experiment.desynchronised_start)
-    return TrainState(jnp.zeros((), jnp.int32), run_key, experiment.learner.init(params), worlds, jnp.array(True))
+    envs = rollout.start(envs_key, experiment.task, experiment.num_envs, experiment.desynchronized_start)
+    return TrainState(jnp.zeros((), jnp.int32), run_key, experiment.learner.init(params), envs, jnp.array(True))
 
 
 @partial(jax.jit, static_argnames="num_updates")
@@ -129,7 +129,7 @@ def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
     """Evaluates the deterministic policy; the worlds depend on the number of updates done, not on the training."""
     key = jax.random.fold_in(_update_key(train_state), 0)
     policy = _policy(experiment, train_state.learner)
-    metrics = rollout.evaluate(key, experiment.task, policy, experiment.eval_worlds)
+    metrics = rollout.evaluate(key, experiment.task, policy, experiment.num_eval_envs)
     return {f"eval/{name}": x for name, x in metrics.items()}
 
 
@@ -138,11 +138,11 @@ def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[Tra
     is_due = state.update % experiment.eval_every == 0
     eval_metrics = _evaluate_if(is_due, experiment, state)
     rollout_key, learner_key = jax.random.split(jax.random.fold_in(_update_key(state), 1))
-    worlds, trajectory, train_metrics = rollout.collect(
+    envs, trajectory, train_metrics = rollout.collect(
         rollout_key,
         experiment.task,
         _policy(experiment, state.learner),
-        state.worlds,
+        state.envs,
         experiment.num_steps,
         experiment.num_start_states,
     )
@@ -151,7 +151,7 @@ def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[Tra
     )
     metrics = eval_metrics | {f"train/{name}": x for name, x in train_metrics.items()}
     metrics |= {f"learner/{name}": x for name, x in learner_metrics.items()}
-    after = TrainState(state.update + 1, state.key, learner, worlds, state.is_finite)
+    after = TrainState(state.update + 1, state.key, learner, envs, state.is_finite)
     is_finite = state.is_finite & _are_finite(learner.params, metrics)
     is_finite &= jnp.isfinite(metrics["eval/return"]) | ~is_due
     kept = jax.tree.map(lambda a, b: jnp.where(is_finite, a, b), after, state)

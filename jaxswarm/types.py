@@ -65,12 +65,12 @@ def _holds(is_accepted: Callable[[Any], bool], value: Any) -> bool:
         return False
 
 
-def is_whole(least: int) -> Callable[[Any], bool]:
+def is_integer(least: int) -> Callable[[Any], bool]:
     """Accepts integers from `least`."""
     return lambda value: isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
-def is_flag(value: Any) -> bool:
+def is_bool(value: Any) -> bool:
     """Accepts truth values, and nothing that stands for one."""
     return isinstance(value, bool | np.bool_)
 

@@ -14,7 +14,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 def pytest_configure(config):
     """Keeps what is compiled for other tests, for programs that they start, and for the next time tests are run.
 
-    Compiling is most of what fast tests take, so that they compile with few optimisations. The slow ones, and all
+    Compiling is most of what fast tests take, so that they compile with few optimizations. The slow ones, and all
     without `-m "not slow"`, compile as users do.
     """
     home = config.cache.mkdir("xdg")
@@ -26,7 +26,7 @@ def pytest_configure(config):
 
 
 @pytest.fixture
-def few_optimisations(monkeypatch):
+def few_optimizations(monkeypatch):
     """For slow tests that ask whether programs run, or run alike; compiling takes half the time."""
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     jax.config.update("jax_disable_most_optimizations", True)
@@ -38,16 +38,16 @@ def few_optimisations(monkeypatch):
 def run_dir(tmp_path_factory):
     """The folder of a tiny run that has just begun."""
     from jaxswarm import config as configs  # noqa: PLC0415
-    from jaxswarm.checkpoint import Checkpoints  # noqa: PLC0415
+    from jaxswarm.host.checkpoint import Checkpoints  # noqa: PLC0415
     from jaxswarm.training import init  # noqa: PLC0415
 
-    words = (
-        "task.num_agents=3 task.episode_length=5 num_worlds=2 num_steps=4 learner.batch_size=12 eval_worlds=1 "
+    overrides = (
+        "task.num_agents=3 task.episode_length=5 num_envs=2 num_steps=4 learner.batch_size=12 num_eval_envs=1 "
         "eval_every=3 network.encoder=[4] network.decoder=[4] num_updates=1"
     )
     run_dir = tmp_path_factory.mktemp("runs") / "run"
     run_dir.mkdir()
-    config = configs.compose(words.split())
+    config = configs.compose(overrides.split())
     (run_dir / "config.yaml").write_text(configs.dump(config))
     checkpoints = Checkpoints(run_dir / "checkpoints")
     state = init(configs.build(config), jax.random.key(0))

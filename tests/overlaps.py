@@ -8,7 +8,7 @@ RADIUS, HALF = 0.0165, 0.05
 
 
 def overlaps(state, side):
-    """The deepest overlap of each kind of pair, in metres, over all states."""
+    """The deepest overlap of each kind of pair, in meters, over all states."""
     disc, box = np.float64(state.position), np.float64(state.box_position)
     angle = np.float64(state.box_heading)
     discs, boxes = range(disc.shape[-2]), range(box.shape[-2])

@@ -74,7 +74,7 @@ PROBES = {
 }
 
 OPTIONS = {"num_epochs": 8, "batch_size": 64, "learning_rate": 3e-3, "discount": 0.5}
-SIZES = {"num_worlds": 64, "num_steps": 2, "eval_worlds": 8, "eval_every": 20}
+SIZES = {"num_envs": 64, "num_steps": 2, "num_eval_envs": 8, "eval_every": 20}
 NUM_UPDATES = 40
 NETWORK = ActorCritic(encoder=(8,), decoder=(16,), aggregator=AGGREGATORS["mean"](), action_dim=1)
 CASES = [

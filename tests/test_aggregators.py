@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxswarm import AGGREGATORS
 from jaxswarm.aggregators.monoids import softplus_precision
-from jaxswarm.sets import DenseView, Segments, segments_of
+from jaxswarm.aggregators.sets import DenseView, Segments, segments_of
 
 WIDTH, SLOTS, RECEIVERS, OWN = 4, 5, 3, 2
 SMALL = {

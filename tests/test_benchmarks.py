@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-TINY = ["num_worlds=2", "num_steps=4", "learner.batch_size=20", "eval_worlds=1"]
-WORDS = {
+TINY = ["num_envs=2", "num_steps=4", "learner.batch_size=20", "num_eval_envs=1"]
+OVERRIDES = {
     "aggregation": ["aggregators=mean,max", "rows=8", "slots=3", "features=4", "repeats=1"],
     "box_physics": ["worlds=1", "seconds=0.01"],
     "environment_throughput": ["worlds=1", "agents=3", "repeats=1"],
@@ -29,17 +29,17 @@ def numbers(tree):
 
 
 def test_all_benchmarks_are_run_here():
-    assert {path.stem for path in BENCHMARKS.glob("*.py")} == {*WORDS, "timing"}
+    assert {path.stem for path in BENCHMARKS.glob("*.py")} == {*OVERRIDES, "timing"}
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
-@pytest.mark.parametrize("name", sorted(WORDS))
+@pytest.mark.usefixtures("few_optimizations")
+@pytest.mark.parametrize("name", sorted(OVERRIDES))
 def test_benchmark_prints_possible_figures(name):
     if name == "box_physics" and not importlib.util.find_spec("Box2D"):
         pytest.skip("Box2D is not installed")
     run = subprocess.run(
-        [sys.executable, BENCHMARKS / f"{name}.py", *WORDS[name]], check=False, capture_output=True, text=True
+        [sys.executable, BENCHMARKS / f"{name}.py", *OVERRIDES[name]], check=False, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
     rows = [json.loads(line) for line in run.stdout.splitlines()]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxswarm import rigid2d
+from jaxswarm.physics import rigid2d
 from jaxswarm.tasks.boxes import Assembly, Clustering, State
 
 GOLDEN = np.load(pathlib.Path(__file__).parent / "golden" / "boxes.npz")
@@ -81,7 +81,7 @@ def test_recorded_observations_are_reproduced(case):
     num_agents, recorded = case["n_agents"], record(case, "obs")
     rows, boxes, own = np.split(recorded, [5 * (num_agents - 1), recorded.shape[-1] - 5], axis=-1)
 
-    # Recorded neighbours stand in the order of their index; ours in cyclic order from the robot on.
+    # Recorded neighbors stand in the order of their index; ours in cyclic order from the robot on.
     index = (np.arange(num_agents)[:, None] + np.arange(1, num_agents)) % num_agents
     neighbors = np.take_along_axis(np.asarray(obs.groups["neighbors"].features), np.argsort(index)[None, ..., None], 2)
     np.testing.assert_allclose(neighbors, rows.reshape(*rows.shape[:2], -1, 5), atol=2e-5)
@@ -337,7 +337,7 @@ def test_robots_that_drive_straight_on_score_as_untrained_networks_did(task, exp
         (Assembly, "active_boxes", (1, 5), r"null, a pair \(low, high\) from 1 to 4"),
         (Clustering, "num_clusters", 5, "whole numbers from 1 to 4"),
         (Clustering, "reward", "explicit", "amplified, corners"),
-        (Clustering, "cluster_identity", "colour", "groups, one-hot"),
+        (Clustering, "cluster_identity", "color", "groups, one-hot"),
     ],
 )
 def test_impossible_fields_are_named_with_what_is_accepted(task, field, value, accepted):

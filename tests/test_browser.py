@@ -6,7 +6,7 @@ import os
 import shutil
 
 import pytest
-from films import episode
+from example_films import episode
 
 from jaxswarm.render import page as pages
 
@@ -62,8 +62,8 @@ def ready(page):
     return page
 
 
-def colours(page, canvas="figure canvas"):
-    """Number of different colours that were drawn."""
+def colors(page, canvas="figure canvas"):
+    """Number of different colors that were drawn."""
     script = """canvas => {
       const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", {willReadFrequently: true});
       copy.drawImage(canvas, 0, 0);
@@ -90,8 +90,8 @@ def click_agent(page, agent, figure=0):
 @pytest.mark.parametrize(("name", "size"), list(itertools.product(FILMS, SIZES)))
 def test_a_page_draws_and_fits(show, name, size):
     page = ready(show(pages.html([episode(**FILMS[name])]), size))
-    assert colours(page) > 20
-    assert colours(page, "#timeline") > 2
+    assert colors(page) > 20
+    assert colors(page, "#timeline") > 2
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert page.locator("figure h2").inner_text() == "walk </script> <b>"
 
@@ -146,7 +146,7 @@ def test_a_selected_agent_tells_what_it_looks_at(show, size):
     film = episode(num_evaders=2)
     page = ready(show(pages.html([film]), size))
     page.locator("#scrub").fill("12")
-    before = colours(page)
+    before = colors(page)
     click_agent(page, 4)
     selected = page.evaluate("page.films[0].selected")
     told = page.locator(".seen")
@@ -156,7 +156,7 @@ def test_a_selected_agent_tells_what_it_looks_at(show, size):
     first = told.locator("li").first.inner_text()
     assert first.startswith(f"agent {body} ")
     assert float(first.split()[2]) == pytest.approx(percent, rel=0.06)
-    assert colours(page) > before
+    assert colors(page) > before
     page.keyboard.press("Escape")
     assert "Select an agent" in told.inner_text()
 
@@ -173,7 +173,7 @@ def test_films_play_side_by_side_in_step(show):
     assert one["y"] == two["y"]
     assert one["x"] + one["width"] <= two["x"]
     page.locator("#scrub").fill("39")
-    assert colours(page) > 20  # the shorter one stands at its end
+    assert colors(page) > 20  # the shorter one stands at its end
     click_agent(page, 2, 0)
     assert page.evaluate("page.films.map(film => film.selected === null)") == [False, True]
 
@@ -193,4 +193,4 @@ def test_a_page_is_dark_where_people_like_it_dark(show):
     schemes = [ready(show(text, color_scheme=scheme)) for scheme in ("light", "dark")]
     light, dark = (page.evaluate("getComputedStyle(document.body).backgroundColor") for page in schemes)
     assert light != dark
-    assert all(colours(page) > 20 for page in schemes)
+    assert all(colors(page) > 20 for page in schemes)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxswarm import checkpoint
-from jaxswarm.checkpoint import CheckpointError, Checkpoints
+from jaxswarm.host import checkpoint
+from jaxswarm.host.checkpoint import CheckpointError, Checkpoints
 from jaxswarm.types import pytree
 
 

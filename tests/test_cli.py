@@ -14,14 +14,18 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import checkpoint, imports, policies, reporting, rollout
 from jaxswarm import config as configs
-from jaxswarm.cli import evaluate, train, words
-from jaxswarm.fit import abstract_state
+from jaxswarm import files, rollout
+from jaxswarm.cli import evaluate, train
+from jaxswarm.cli import program as commands
+from jaxswarm.config import plugins as imports
+from jaxswarm.host import checkpoint
+from jaxswarm.host import trained as policies
+from jaxswarm.host.fit import abstract_state
 
 TINY = [
-    *("task.num_agents=3", "task.episode_length=5", "num_worlds=2", "num_steps=4", "learner.batch_size=12"),
-    *("eval_worlds=2", "eval_every=3", "network.encoder=[4]", "network.decoder=[4]", "seed=5"),
+    *("task.num_agents=3", "task.episode_length=5", "num_envs=2", "num_steps=4", "learner.batch_size=12"),
+    *("num_eval_envs=2", "eval_every=3", "network.encoder=[4]", "network.decoder=[4]", "seed=5"),
 ]
 
 
@@ -42,7 +46,7 @@ def test_training_ends_with_its_files_and_the_next_command(finished, tmp_path, m
     assert {path.name for path in run_dir.iterdir()} == names
     assert all(f"{run_dir.relative_to(tmp_path)}/{name}" in out for name in names)
     assert out.splitlines()[-1].startswith("next: jaxswarm-eval runs/rendezvous-mean-ppo-")
-    same = [reporting.read_rows(path / "metrics.csv") for path in (run_dir, finished)]
+    same = [files.read_rows(path / "metrics.csv") for path in (run_dir, finished)]
     assert [row["eval/return"] for row in same[0]] == [row["eval/return"] for row in same[1]]
     assert {row["seed"] for row in same[0]} == {5}
 
@@ -64,40 +68,40 @@ def test_resuming_a_finished_run_says_so(finished, capsys):
 
 def test_a_finished_run_can_be_made_longer(finished, capsys):
     assert train.main([f"resume={finished}", "num_updates=5"]) == 0
-    assert [row["update"] for row in reporting.read_rows(finished / "metrics.csv")] == [0, 3, 5]
+    assert [row["update"] for row in files.read_rows(finished / "metrics.csv")] == [0, 3, 5]
     assert "num_updates: 5" in (finished / "config.yaml").read_text()
 
 
 @pytest.mark.parametrize(
-    ("words", "parts"),
+    ("overrides", "parts"),
     [
         (["num_updates=2"], ["2 updates", "4 updates or more"]),
         (["learner.learning_rate=1"], ["learner.learning_rate cannot be changed here", "num_updates=N"]),
         (["run_dir=x"], ["one of run_dir and resume"]),
     ],
 )
-def test_nothing_but_the_length_changes_on_resume(finished, capsys, words, parts):
+def test_nothing_but_the_length_changes_on_resume(finished, capsys, overrides, parts):
     parts = [part.replace("4 updates", "5 updates") for part in parts]
     assert train.main([f"resume={finished}", "num_updates=5"]) == 0
-    assert train.main([f"resume={finished}", *words]) == 2
+    assert train.main([f"resume={finished}", *overrides]) == 2
     err = capsys.readouterr().err
     assert all(part in err for part in parts), err
 
 
 @pytest.mark.parametrize(
-    ("words", "parts"),
+    ("overrides", "parts"),
     [
         (["task.num_agent=5"], ["did you mean 'task.num_agents'"]),
         (["learner.batch_size=7"], ["batch_size = 7", "divisors"]),
-        (["num_worlds=0"], ["num_worlds = 0"]),
+        (["num_envs=0"], ["num_envs = 0"]),
         (["--verbose"], ["'--verbose'", "key=value"]),
         (["run_dir="], ["run_dir has no value"]),
         (["resume=nowhere"], ["nowhere is not a run folder"]),
     ],
 )
-def test_a_wrong_command_is_one_line_and_writes_nothing(tmp_path, monkeypatch, capsys, words, parts):
+def test_a_wrong_command_is_one_line_and_writes_nothing(tmp_path, monkeypatch, capsys, overrides, parts):
     monkeypatch.chdir(tmp_path)
-    assert train.main(words) == 2
+    assert train.main(overrides) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
@@ -124,7 +128,7 @@ def test_a_reader_that_goes_away_is_no_mistake():
     ],
 )
 def test_what_machines_refuse_is_one_line(error, part, capsys):
-    @words.program
+    @commands.program
     def main(arguments):
         raise error
 
@@ -135,7 +139,7 @@ def test_what_machines_refuse_is_one_line(error, part, capsys):
 
 
 def test_other_errors_are_not_hidden():
-    @words.program
+    @commands.program
     def main(arguments):
         raise RuntimeError("a mistake in the program")
 
@@ -146,7 +150,7 @@ def test_other_errors_are_not_hidden():
 def test_help_shows_groups_choices_and_keys(capsys):
     assert train.main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_worlds: 32", "resume=PATH"))
+    assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_envs: 32", "resume=PATH"))
     assert train.main(["task=pursuit_multi", "--help"]) == 0
     out = capsys.readouterr().out
     assert all(
@@ -174,14 +178,14 @@ def test_what_users_registered_has_help(tmp_path, monkeypatch, capsys):
 
 def test_a_larger_swarm_begins_with_the_policy_of_a_smaller_one(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(finished.parent)
-    words = [*TINY, "task.num_agents=6", "num_updates=1", "init_from=finished", f"run_dir={tmp_path / 'larger'}"]
-    assert train.main(words) == 0
+    overrides = [*TINY, "task.num_agents=6", "num_updates=1", "init_from=finished", f"run_dir={tmp_path / 'larger'}"]
+    assert train.main(overrides) == 0
     assert "(at first " in capsys.readouterr().out
     params = policies.load(finished)[1]
     larger = configs.build(configs.load(tmp_path / "larger" / "config.yaml"))
     start = jaxswarm.init(larger, jax.random.key(5))
     start = start.replace(learner=start.learner.replace(params=params))
-    first = reporting.read_rows(tmp_path / "larger" / "metrics.csv")[0]
+    first = files.read_rows(tmp_path / "larger" / "metrics.csv")[0]
     assert first["eval/return"] == pytest.approx(float(jaxswarm.evaluate(larger, start)["eval/return"]), abs=1e-4)
     monkeypatch.chdir(tmp_path)
     moved = finished.rename(tmp_path / "moved")
@@ -199,7 +203,7 @@ def test_programs_take_folders_with_any_name(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     folder = tmp_path / "a=b c"
     folder.mkdir()
-    paths, options, others = words.split_paths([str(folder), "out=~/x.html", "seed=1"], ("out",))
+    paths, options, others = commands.split_paths([str(folder), "out=~/x.html", "seed=1"], ("out",))
     assert (paths, options, others) == ([folder], {"out": str(tmp_path / "x.html")}, ["seed=1"])
 
 
@@ -221,15 +225,15 @@ def test_processes_that_do_not_know_their_number_are_told(monkeypatch, capsys, v
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [[], ["checkpoint=last", "num_agents=7", "episodes=3"]])
-def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, words):
-    assert evaluate.main([str(finished), "seed=1", *words]) == 0
+@pytest.mark.parametrize("overrides", [[], ["checkpoint=last", "num_agents=7", "episodes=3"]])
+def test_a_policy_is_evaluated_also_with_more_agents(finished, capsys, overrides):
+    assert evaluate.main([str(finished), "seed=1", *overrides]) == 0
     out = capsys.readouterr().out
     path = out.splitlines()[-1].removeprefix("wrote ")
     result = json.loads(Path(path).read_text())
     (played,) = result["results"]
-    assert played["task"]["num_agents"] == (7 if words else 3)
-    assert result["episodes"] == (3 if words else 2)
+    assert played["task"]["num_agents"] == (7 if overrides else 3)
+    assert result["episodes"] == (3 if overrides else 2)
     assert f"{played['metrics']['return']:.4f}" in out
 
 
@@ -259,7 +263,7 @@ def test_a_policy_is_loaded(finished, tmp_path):
 
 
 def test_a_policy_outlives_the_rest_of_its_training_state(finished):
-    config = configs.override(configs.load(finished / "config.yaml"), [("num_worlds", 4), ("total_agent_steps", 480)])
+    config = configs.override(configs.load(finished / "config.yaml"), [("num_envs", 4), ("total_agent_steps", 480)])
     assert policies.read(finished, config, "best", [5]).params is not None  # its checkpoint has two worlds
 
 
@@ -270,7 +274,7 @@ def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch)
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "replace_text", full)
+        patch.setattr(files, "replace_text", full)
         assert evaluate.main([str(finished)]) == 1
     assert "capture_time" in capsys.readouterr().out  # the table is not lost
     assert evaluate.main([str(finished)]) == 0
@@ -283,12 +287,12 @@ def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("words", "part"),
+    ("overrides", "part"),
     [
         (["checkpoint=first"], "accepted: best, last"),
         (["episodes=0"], "episodes = 0"),
         (["episodes=many"], "episodes = many"),
-        (["num_worlds=3"], "num_worlds cannot be changed here"),
+        (["num_envs=3"], "num_envs cannot be changed here"),
         (["episode=3"], "did you mean 'episodes'"),
         (["task.num_agent=3"], "did you mean 'task.num_agents'"),
         (["task.num_agents=0"], "num_agents = 0"),
@@ -296,8 +300,8 @@ def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch)
         (["another"], "give one run folder"),
     ],
 )
-def test_a_wrong_evaluation_is_one_line(finished, capsys, words, part):
-    assert evaluate.main([str(finished), *words]) == 2
+def test_a_wrong_evaluation_is_one_line(finished, capsys, overrides, part):
+    assert evaluate.main([str(finished), *overrides]) == 2
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1
@@ -308,10 +312,10 @@ def test_a_folder_without_a_run_cannot_be_evaluated(tmp_path, capsys):
     assert "is not a run folder" in capsys.readouterr().err
 
 
-def start(*words):
+def start(*overrides):
     program = "import sys; from jaxswarm.cli import train; sys.exit(train.main(sys.argv[1:]))"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, "-c", program, *map(str, words)], **pipes)
+    return subprocess.Popen([sys.executable, "-c", program, *map(str, overrides)], **pipes)
 
 
 def table(run_dir):
@@ -321,18 +325,18 @@ def table(run_dir):
 
 
 def wait_for_rows(process, run_dir, num_rows):
-    while process.poll() is None and len(reporting.read_rows(run_dir / "metrics.csv")) < num_rows:
+    while process.poll() is None and len(files.read_rows(run_dir / "metrics.csv")) < num_rows:
         time.sleep(0.005)
     assert process.poll() is None, process.communicate()
 
 
 @pytest.mark.slow
 def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path, monkeypatch):
-    words = [*TINY, "num_updates=900", "checkpoint_seconds=0.05"]
+    overrides = [*TINY, "num_updates=900", "checkpoint_seconds=0.05"]
     undisturbed, run_dir = tmp_path / "undisturbed", tmp_path / "run"
-    assert train.main([*words, f"run_dir={undisturbed}"]) == 0
+    assert train.main([*overrides, f"run_dir={undisturbed}"]) == 0
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    process = start(*words, f"run_dir={run_dir}")
+    process = start(*overrides, f"run_dir={run_dir}")
     for num_rows, number, code in ((30, signal.SIGKILL, -9), (80, signal.SIGKILL, -9), (130, signal.SIGTERM, 0)):
         wait_for_rows(process, run_dir, num_rows)
         process.send_signal(number)
@@ -355,7 +359,7 @@ def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path, monk
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(tmp_path):
     (tmp_path / "mine.py").write_text(
         "import jaxswarm\nfrom jaxswarm.tasks import Rendezvous\nfrom jaxswarm.types import pytree\n"
@@ -363,8 +367,13 @@ def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(tmp_path):
     )
     (tmp_path / "elsewhere").mkdir()
 
-    def run(name, *words, cwd=tmp_path):
-        command = [sys.executable, "-c", f"import sys; from jaxswarm.cli.{name} import main; sys.exit(main())", *words]
+    def run(name, *overrides, cwd=tmp_path):
+        command = [
+            sys.executable,
+            "-c",
+            f"import sys; from jaxswarm.cli.{name} import main; sys.exit(main())",
+            *overrides,
+        ]
         subprocess.run(command, check=True, cwd=cwd, capture_output=True)
 
     run("train", "imports=mine.py", "task=costly", *TINY, "num_updates=1", "run_dir=run")
@@ -377,4 +386,4 @@ def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(tmp_path):
     (tmp_path / "mine.py").unlink()  # the folder has a copy, on whatever machine it is
     (tmp_path / "run").rename(tmp_path / "moved")
     run("train", "resume=moved", "num_updates=3")
-    assert reporting.read_rows(tmp_path / "moved" / "metrics.csv")[-1]["update"] == 3
+    assert files.read_rows(tmp_path / "moved" / "metrics.csv")[-1]["update"] == 3

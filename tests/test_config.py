@@ -8,10 +8,11 @@ import pytest
 from flax import linen as nn
 
 import jaxswarm
-from jaxswarm import AGGREGATORS, TASKS, imports
+from jaxswarm import AGGREGATORS, TASKS
 from jaxswarm import config as configs
 from jaxswarm.config import ConfigError
-from jaxswarm.fit import fit
+from jaxswarm.config import plugins as imports
+from jaxswarm.host.fit import fit
 
 
 @pytest.mark.parametrize(
@@ -34,18 +35,27 @@ def test_groups_are_found_from_any_directory(tmp_path, monkeypatch):
 
 
 def test_words_reach_the_experiment():
-    words = ["aggregator=bayesian", "learner.learning_rate=1e-2", "task.num_agents=5", "task.side=50", "num_worlds=8"]
-    experiment = configs.build(configs.compose([*words, "learner.batch_size=80", "network.encoder=[7,8]"]))
+    overrides = ["aggregator=bayesian", "learner.learning_rate=1e-2", "task.num_agents=5", "task.side=50", "num_envs=8"]
+    experiment = configs.build(configs.compose([*overrides, "learner.batch_size=80", "network.encoder=[7,8]"]))
     assert type(experiment.network.aggregator).__name__ == "Bayesian"
     assert (experiment.learner.learning_rate, experiment.learner.batch_size) == (0.01, 80)
-    assert (experiment.task.num_agents, experiment.num_worlds, experiment.network.encoder) == (5, 8, (7, 8))
+    assert (experiment.task.num_agents, experiment.num_envs, experiment.network.encoder) == (5, 8, (7, 8))
     assert isinstance(experiment.task.side, float)  # an integer leaf would be another program
 
 
 def test_a_field_needs_no_prefix_where_only_one_part_has_it():
-    words = ["learner=trl", "projection=kl", "mean_bound=0.03", "cov_bound=0.001", "coefficient=8", "num_agents=7"]
-    config = configs.compose(words)
-    assert config == configs.compose([f"learner.{word}" if i in (1, 2, 3, 4) else word for i, word in enumerate(words)])
+    overrides = [
+        "learner=trl",
+        "projection=kl",
+        "mean_bound=0.03",
+        "cov_bound=0.001",
+        "regression_coefficient=8",
+        "num_agents=7",
+    ]
+    config = configs.compose(overrides)
+    assert config == configs.compose(
+        [f"learner.{word}" if i in (1, 2, 3, 4) else word for i, word in enumerate(overrides)]
+    )
     assert (config["learner"]["projection"], config["task"]["num_agents"]) == ("kl", 7)
 
 
@@ -61,19 +71,24 @@ def test_the_thesis_setting_has_the_thesis_arithmetic():
 
 
 def test_trust_region_layers_are_configured_by_words():
-    words = ["learner=trl", "learner.projection=kl", "learner.mean_bound=0.05", "learner.coefficient=8"]
-    experiment = configs.build(configs.compose([*words, "network.std=state"]))
+    overrides = ["learner=trl", "learner.projection=kl", "learner.mean_bound=0.05", "learner.regression_coefficient=8"]
+    experiment = configs.build(configs.compose([*overrides, "network.std=state"]))
     learner = experiment.learner
-    assert (learner.projection, learner.mean_bound, learner.cov_bound, learner.coefficient) == ("kl", 0.05, 1e-3, 8.0)
+    assert (learner.projection, learner.mean_bound, learner.cov_bound, learner.regression_coefficient) == (
+        "kl",
+        0.05,
+        1e-3,
+        8.0,
+    )
     assert experiment.network.std == "state"
     experiment = configs.build(configs.compose(["experiment=rendezvous_thesis", "learner=trl_thesis"]))
     assert (experiment.learner.objective, experiment.learner.projection) == ("raw", "wasserstein")
 
 
 def test_words_win_over_an_experiment():
-    config = configs.compose(["experiment=rendezvous_thesis", "learner=ppo", "num_worlds=16", "total_agent_steps=5"])
-    assert config["learner"]["minibatch"] == "worlds"
-    assert (config["num_worlds"], config["num_updates"], config["total_agent_steps"]) == (16, None, 5)
+    config = configs.compose(["experiment=rendezvous_thesis", "learner=ppo", "num_envs=16", "total_agent_steps=5"])
+    assert config["learner"]["sampling_unit"] == "envs"
+    assert (config["num_envs"], config["num_updates"], config["total_agent_steps"]) == (16, None, 5)
 
 
 def test_a_length_in_agent_steps_is_rounded_up():
@@ -98,7 +113,7 @@ def test_fields_that_no_file_mentions_get_their_defaults():
     ("word", "parts"),
     [
         ("taks=rendezvous", ["'taks'", "did you mean 'task'"]),
-        ("num_world=3", ["did you mean 'num_worlds'", "num_steps"]),
+        ("num_env=3", ["did you mean 'num_envs'", "num_steps"]),
         ("learning_rat=3", ["did you mean 'learner.learning_rate'"]),
         ("learning_rate=fast", ["learner.learning_rate = 'fast'"]),
         ("name=ppo", ["name is a field of task and aggregator and learner", "learner.name"]),
@@ -109,8 +124,8 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("task.name=x", ["task.name", "'x'", "rendezvous"]),
         ("learner.learning_rate=fast", ["learner.learning_rate", "'fast'", "a number"]),
         ("learner.learning_rate=nan", ["nan", "a number"]),
-        ("num_worlds=2.5", ["num_worlds", "2.5", "an integer"]),
-        ("num_worlds=true", ["True", "an integer"]),
+        ("num_envs=2.5", ["num_envs", "2.5", "an integer"]),
+        ("num_envs=true", ["True", "an integer"]),
         ("total_agent_steps=1e6", ["an integer", "write 1000000"]),
         ("task.torus=1", ["task.torus", "true, false"]),
         ("learner=trl_thesi", ["did you mean 'trl_thesis'", "ppo_thesis"]),
@@ -125,7 +140,7 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("seed=1,2", ["'seed=1,2'", "one value"]),
         ("+seed=1", ["'+seed=1'", "key=value"]),
         ("~seed", ["'~seed'", "key=value"]),
-        ("num_worlds=0", ["num_worlds = 0"]),
+        ("num_envs=0", ["num_envs = 0"]),
         ("task.num_agents=0", ["num_agents = 0"]),
         ("task.visibility_radius=-1", ["visibility_radius = -1.0"]),
         ("learner.batch_size=77", ["batch_size = 77", "divisors"]),
@@ -172,11 +187,11 @@ def test_run_settings_are_the_keys_beside_the_experiment():
 
 
 def test_heads_have_to_share_the_width():
-    words = ["aggregator=attentive", "aggregator.num_heads=2"]
-    assert configs.build(configs.compose([*words, "network.encoder=[65,8]"]))
+    overrides = ["aggregator=attentive", "aggregator.num_heads=2"]
+    assert configs.build(configs.compose([*overrides, "network.encoder=[65,8]"]))
     for encoder in ("[65]", "[8] network.shared_encoder=[65]"):
         with pytest.raises(ConfigError, match="num_heads = 2 is not possible; accepted: divisors of 65 features"):
-            configs.build(configs.compose([*words, *f"network.encoder={encoder}".split()]))
+            configs.build(configs.compose([*overrides, *f"network.encoder={encoder}".split()]))
 
 
 OWN = """
@@ -208,12 +223,12 @@ def registries(monkeypatch):
 def test_files_of_a_user_register_choices(registries, tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
-    words = ["imports=mine.py", "experiment=rendezvous_thesis", "task=costly", "aggregator=average", "price=2"]
-    config = configs.compose([*words, "num_agents=5"])
+    overrides = ["imports=mine.py", "experiment=rendezvous_thesis", "task=costly", "aggregator=average", "price=2"]
+    config = configs.compose([*overrides, "num_agents=5"])
     experiment = configs.build(config)
     assert (type(experiment.task).__name__, experiment.task.price, experiment.task.num_agents) == ("Costly", 2.0, 5)
     assert type(experiment.network.aggregator).__name__ == "Average"
-    assert experiment.num_worlds == 10
+    assert experiment.num_envs == 10
     assert config["imports"] == [str(tmp_path / "mine.py")]
     assert "costly" in configs.choices()["task"]
     with pytest.raises(ConfigError, match=r"did you mean 'task.price'"):
@@ -259,8 +274,14 @@ def test_a_run_folder_keeps_the_files_that_it_needs(registries, tmp_path, monkey
 @pytest.mark.slow
 def test_run_folders_of_fit_name_the_files_of_a_users_task(registries, tmp_path):
     (tmp_path / "mine.py").write_text(OWN)
-    words = [f"imports={tmp_path / 'mine.py'}", "task=costly", "num_agents=3", "task.episode_length=5", "num_worlds=2"]
-    experiment = configs.build(configs.compose([*words, "num_steps=4", "learner.batch_size=12", "eval_worlds=2"]))
+    overrides = [
+        f"imports={tmp_path / 'mine.py'}",
+        "task=costly",
+        "num_agents=3",
+        "task.episode_length=5",
+        "num_envs=2",
+    ]
+    experiment = configs.build(configs.compose([*overrides, "num_steps=4", "learner.batch_size=12", "num_eval_envs=2"]))
     fit(experiment, 1, run_dir=tmp_path / "run", progress=False)
     assert configs.read(tmp_path / "run" / "config.yaml")["imports"] == [str(tmp_path / "mine.py")]
     assert [path.name for path in (tmp_path / "run" / "imports").iterdir()] == ["0-mine.py"]
@@ -268,8 +289,8 @@ def test_run_folders_of_fit_name_the_files_of_a_users_task(registries, tmp_path)
 
 def test_presets_are_experiments_in_python_too():
     experiment = jaxswarm.experiment("experiment=pursuit_best", "task.num_agents=20")
-    words = ["experiment=pursuit_best", "task.num_agents=20"]
-    assert jax.tree.structure(experiment) == jax.tree.structure(configs.build(configs.compose(words)))
+    overrides = ["experiment=pursuit_best", "task.num_agents=20"]
+    assert jax.tree.structure(experiment) == jax.tree.structure(configs.build(configs.compose(overrides)))
     assert (type(experiment.task).__name__, experiment.task.num_agents) == ("Pursuit", 20)
 
 
@@ -327,9 +348,9 @@ def test_an_import_that_fails_is_named(registries, tmp_path, text, part):
 
 @pytest.mark.slow
 def test_what_aggregators_cannot_share_is_said_before_training():
-    words = ["task=pursuit", "aggregator=concat", "network.latent_space=shared"]
+    overrides = ["task=pursuit", "aggregator=concat", "network.latent_space=shared"]
     with pytest.raises(ConfigError, match=r"latent_space = 'shared' is not possible for evaders, neighbors"):
-        configs.build(configs.compose(words))
+        configs.build(configs.compose(overrides))
 
 
 def test_imports_are_names():

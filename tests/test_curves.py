@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxswarm import curves
-from jaxswarm.curves import Curve
+from jaxswarm.analysis import curves
+from jaxswarm.analysis.curves import Curve
 
 
 def make_curve(x, y):
@@ -91,8 +91,8 @@ def test_the_interquartile_mean_drops_a_quarter_on_either_side(seeds):
 def test_the_interval_is_that_of_redrawn_seeds():
     values = np.random.default_rng(1).normal(size=(10, 2))
     _, lower, upper = curves.interquartile_mean(values)
-    redrawn = values[np.random.default_rng(2).integers(10, size=(20_000, 10))]
-    expected = np.percentile(np.sort(redrawn, axis=1)[:, 2:8].mean(axis=1), [2.5, 97.5], axis=0)
+    bootstrapped = values[np.random.default_rng(2).integers(10, size=(20_000, 10))]
+    expected = np.percentile(np.sort(bootstrapped, axis=1)[:, 2:8].mean(axis=1), [2.5, 97.5], axis=0)
     np.testing.assert_allclose([lower, upper], expected, atol=0.05)
 
 

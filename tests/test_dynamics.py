@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxswarm.dynamics import DYNAMICS, Acceleration, Velocity
-from jaxswarm.geometry import Plane, Torus
+from jaxswarm.physics.dynamics import DYNAMICS, Acceleration, Velocity
+from jaxswarm.physics.geometry import Plane, Torus
 from jaxswarm.types import pytree
 
 SIDE = 10.0

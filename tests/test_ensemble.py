@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import checkpoint, config, ensemble, reporting
-from jaxswarm.fit import DivergedError, abstract_state, fit, fit_runs
-from jaxswarm.recording import Run
+from jaxswarm import config, files
+from jaxswarm.host import checkpoint, ensemble
+from jaxswarm.host.fit import DivergedError, abstract_state, fit, fit_runs
+from jaxswarm.host.recorder import Run
 
-WORDS = (
-    "task.num_agents=3 task.episode_length=5 num_worlds=4 num_steps=4 learner.batch_size=24 eval_worlds=2 eval_every=3 "
+OVERRIDES = (
+    "task.num_agents=3 task.episode_length=5 num_envs=4 num_steps=4 learner.batch_size=24 num_eval_envs=2 eval_every=3 "
     "network.encoder=[4] network.decoder=[4]"
 )
-EXPERIMENT = config.build(config.compose(WORDS.split()))
+EXPERIMENT = config.build(config.compose(OVERRIDES.split()))
 DIVERGING = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
 OPTIONS = {"progress": False, "checkpoint_seconds": 0.0}
 
@@ -57,7 +58,7 @@ def test_each_seed_is_the_single_run_of_that_seed_bit_by_bit(three_seeds):
 def test_rows_keep_seeds_apart(three_seeds):
     _, rows, run_dir = three_seeds
     assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 6, 9, 10) for s in (5, 6, 7)]
-    on_disk = reporting.read_rows(run_dir / "metrics.csv")
+    on_disk = files.read_rows(run_dir / "metrics.csv")
     np.testing.assert_array_equal(*[np.float32([row["eval/return"] for row in x]) for x in (on_disk, rows)])
     assert json.loads((run_dir / "manifest.json").read_text())["seeds"] == [5, 6, 7]
 
@@ -94,12 +95,12 @@ def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time_and_says_if_one
 
 def test_what_a_container_may_take_is_its_limit_less_what_it_cannot_drop(tmp_path):
     assert ensemble._allotted(tmp_path) == math.inf
-    for folder, limit, used, files in (
+    for folder, limit, used, cached in (
         (tmp_path / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
         (tmp_path, "memory.max", "memory.current", "inactive_file"),
     ):
         folder.mkdir(exist_ok=True)
-        (folder / "memory.stat").write_text(f"anon 5\n{files} 100\n")
+        (folder / "memory.stat").write_text(f"anon 5\n{cached} 100\n")
         (folder / limit).write_text("1000\n")
         (folder / used).write_text("700\n")
         assert ensemble._allotted(tmp_path) == 400
@@ -157,26 +158,26 @@ from jaxswarm import ensemble
 from tests_config import EXPERIMENT, train
 num_runs = int(sys.argv[1])
 states, mesh = train(num_runs)
-assert dict(mesh.shape) == {"runs": int(sys.argv[2]), "worlds": int(sys.argv[3])}, mesh
+assert dict(mesh.shape) == {"runs": int(sys.argv[2]), "envs": int(sys.argv[3])}, mesh
 np.savez(sys.argv[4], *map(np.asarray, jax.tree.leaves(states.learner.params)))
 """
 CONFIG = f"""
 import jax, numpy as np
 from jaxswarm import config, ensemble
-EXPERIMENT = config.build(config.compose({WORDS.split()!r}))
+EXPERIMENT = config.build(config.compose({OVERRIDES.split()!r}))
 def train(num_runs):
     batch = ensemble.make_batch([EXPERIMENT], num_runs)
     states = ensemble.init_batch(batch, range(5, 5 + num_runs))
     program = ensemble.compile_batch(batch, states, 3, print)
     for _ in range(4):
         states, metrics = program(batch.experiments, states, np.int32(3))
-    assert all(len(x.sharding.device_set) == batch.mesh.size for x in jax.tree.leaves(states.worlds))
+    assert all(len(x.sharding.device_set) == batch.mesh.size for x in jax.tree.leaves(states.envs))
     return states, batch.mesh
 """
 
 
 @pytest.mark.parametrize(
-    ("num_runs", "num_worlds", "num_devices", "shape"),
+    ("num_runs", "num_envs", "num_devices", "shape"),
     [
         (4, 32, 2, (2, 1)),
         (1, 32, 8, (1, 8)),
@@ -186,8 +187,8 @@ def train(num_runs):
         (1, 7, 2, (1, 1)),
     ],
 )
-def test_as_many_devices_as_possible_are_used(num_runs, num_worlds, num_devices, shape):
-    assert ensemble.mesh_shape(num_runs, num_worlds, num_devices) == shape
+def test_as_many_devices_as_possible_are_used(num_runs, num_envs, num_devices, shape):
+    assert ensemble.mesh_shape(num_runs, num_envs, num_devices) == shape
 
 
 def test_numbers_of_a_batch_may_be_arrays():
@@ -198,7 +199,7 @@ def test_numbers_of_a_batch_may_be_arrays():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 @pytest.mark.parametrize(("num_runs", "mesh"), [(8, (8, 1)), (2, (2, 4)), (1, (1, 4))])
 def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):
     (tmp_path / "tests_config.py").write_text(CONFIG)
@@ -214,28 +215,28 @@ def test_on_eight_devices_results_are_those_of_one(num_runs, mesh, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 @pytest.mark.parametrize("num_seeds", [2, 1])
 def test_two_processes_train_together_and_the_first_one_writes(num_seeds, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    words = [*WORDS.split(), f"num_seeds={num_seeds}", "seed=5", "num_updates=10", "checkpoint_seconds=0"]
+    overrides = [*OVERRIDES.split(), f"num_seeds={num_seeds}", "seed=5", "num_updates=10", "checkpoint_seconds=0"]
     run = "import sys; from jaxswarm.cli import train; sys.exit(train.main(sys.argv[1:]))"
 
-    def start(index, *words):
+    def start(index, *overrides):
         env = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": str(index)}
-        command = [sys.executable, "-c", run, *words]
+        command = [sys.executable, "-c", run, *overrides]
         return subprocess.Popen(command, cwd=tmp_path, env=os.environ | env, stdout=subprocess.PIPE, text=True)
 
-    for attempt in ([*words, "run_dir=run"], ["resume=run", "num_updates=12"]):
+    for attempt in ([*overrides, "run_dir=run"], ["resume=run", "num_updates=12"]):
         processes = [start(index, *attempt) for index in (0, 1)]
         outputs = [process.communicate(timeout=200)[0] for process in processes]
         assert [process.returncode for process in processes] == [0, 0]
         assert "done: " in outputs[0]
         assert [line for line in outputs[1].splitlines() if "Gloo" not in line] == []  # that library says hello
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    rows = reporting.read_rows(tmp_path / "run" / "metrics.csv")
+    rows = files.read_rows(tmp_path / "run" / "metrics.csv")
     _, expected = fit(EXPERIMENT, 12, seed=5, num_seeds=num_seeds, progress=False)
     kept = [row for row in rows if row["update"] != 10]  # where the first session ended
     assert [(row["update"], row["seed"]) for row in kept] == [(row["update"], row["seed"]) for row in expected]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial import Voronoi
 
-from jaxswarm.geometry import Plane, Torus
-from jaxswarm.tasks.evasion import flight
+from jaxswarm.physics.geometry import Plane, Torus
+from jaxswarm.tasks.evasion import evader_direction
 
 GOLDEN = np.load(pathlib.Path(__file__).parent / "golden" / "evader.npz")
 IS_STABLE = GOLDEN["sensitivity"] < 1e-6
@@ -24,7 +24,7 @@ ROOM = 50
 @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, 0))
 def flights(torus, side, evader, pursuers, num_pursuers, radius):
     is_present = jnp.arange(ROOM) < num_pursuers
-    return flight((Torus if torus else Plane)(side), evader, pursuers, is_present, radius)
+    return evader_direction((Torus if torus else Plane)(side), evader, pursuers, is_present, radius)
 
 
 def recorded_flights(dtype):
@@ -112,7 +112,7 @@ def test_random_directions_are_those_of_voronoi_cells(torus):
 @pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-16, 1e-14, 1e-3])
 def test_no_pursuer_is_too_close(distance):
     room = jnp.ones((1,), bool)
-    way = np.asarray(flight(Plane(100.0), jnp.zeros(2), jnp.array([[distance, 0.0]]), room, 50.0))
+    way = np.asarray(evader_direction(Plane(100.0), jnp.zeros(2), jnp.array([[distance, 0.0]]), room, 50.0))
     assert np.isfinite(way).all()
     assert np.linalg.norm(way) == pytest.approx(float(distance > 1e-15), abs=1e-6)
 

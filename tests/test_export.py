@@ -92,17 +92,17 @@ def test_a_policy_is_exported_for_more_agents(run_dir, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "part"),
+    ("overrides", "part"),
     [
         (["checkpoint=first"], "accepted: best, last"),
         (["train_seed=3"], "train_seed = 3"),
-        (["num_worlds=3"], "num_worlds cannot be changed here"),
+        (["num_envs=3"], "num_envs cannot be changed here"),
         (["task.dynamics=velocity"], "observations of other sizes"),
         (["nowhere"], "give one run folder, not 2"),
     ],
 )
-def test_a_wrong_export_is_one_line(run_dir, tmp_path, capsys, words, part):
-    assert program.main([str(run_dir), f"out={tmp_path / 'p'}", *words]) == 2
+def test_a_wrong_export_is_one_line(run_dir, tmp_path, capsys, overrides, part):
+    assert program.main([str(run_dir), f"out={tmp_path / 'p'}", *overrides]) == 2
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1

@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import checkpoint, config, ensemble, recording, reporting
-from jaxswarm import fit as fitting
+from jaxswarm import config, files
 from jaxswarm.config import ConfigError
-from jaxswarm.fit import DivergedError, fit, fit_runs
-from jaxswarm.recording import Recorder, Run, begun_and_new, locked
+from jaxswarm.host import checkpoint, ensemble
+from jaxswarm.host import fit as fitting
+from jaxswarm.host import recorder as recording
+from jaxswarm.host.fit import DivergedError, fit, fit_runs
+from jaxswarm.host.recorder import Recorder, Run, locked, started_and_new
 from jaxswarm.tasks import Rendezvous
 from jaxswarm.types import pytree
 
-WORDS = (
-    "task.num_agents=3 task.episode_length=5 num_worlds=2 num_steps=4 learner.batch_size=12 eval_worlds=2 eval_every=3 "
+OVERRIDES = (
+    "task.num_agents=3 task.episode_length=5 num_envs=2 num_steps=4 learner.batch_size=12 num_eval_envs=2 eval_every=3 "
     "network.encoder=[4] network.decoder=[4]"
 )
-EXPERIMENT = config.build(config.compose(WORDS.split()))
+EXPERIMENT = config.build(config.compose(OVERRIDES.split()))
 NUM_UPDATES = 8
 OPTIONS = {"progress": False, "checkpoint_seconds": 0.0}
 
@@ -85,7 +87,7 @@ def test_evaluations_without_checkpoints_are_not_trained_over(undisturbed, tmp_p
 @pytest.mark.parametrize(
     ("changes", "seed", "message"),
     [
-        ({"num_worlds": 4}, 3, "num_worlds = 2, not 4"),
+        ({"num_envs": 4}, 3, "num_envs = 2, not 4"),
         ({"learner": EXPERIMENT.learner.replace(learning_rate=1.0)}, 3, r"learner.learning_rate = \S+, not 1.0"),
         ({}, 4, r"seeds = \[3\], not \[4\]"),
     ],
@@ -104,10 +106,10 @@ def test_a_run_is_not_started_anew_because_one_beside_it_is_new(undisturbed, tmp
     with pytest.raises(FileExistsError, match=r"begun holds a run and .*new none"):
         fit_runs(runs, NUM_UPDATES, resume=True, **OPTIONS)
     assert table(tmp_path / "begun") == table(undisturbed[2])
-    assert begun_and_new([tmp_path / "new", tmp_path / "newer"]) == ([tmp_path / "new", tmp_path / "newer"], [])
+    assert started_and_new([tmp_path / "new", tmp_path / "newer"]) == ([tmp_path / "new", tmp_path / "newer"], [])
     (tmp_path / "new").mkdir(exist_ok=True)
     shutil.copy(tmp_path / "begun" / "metrics.csv", tmp_path / "new")  # killed between the first saves of the two
-    assert begun_and_new([tmp_path / "begun", tmp_path / "new"]) == ([tmp_path / "begun", tmp_path / "new"], [])
+    assert started_and_new([tmp_path / "begun", tmp_path / "new"]) == ([tmp_path / "begun", tmp_path / "new"], [])
 
 
 @pytest.mark.parametrize(
@@ -165,7 +167,7 @@ def test_the_run_folder_is_complete(undisturbed):
     run_dir = undisturbed[2]
     names = {"config.yaml", "manifest.json", "metrics.csv", "checkpoints", "curve.png"}
     assert {path.name for path in run_dir.iterdir()} == names
-    seconds = [row["wall_seconds"] for row in reporting.read_rows(run_dir / "metrics.csv")]
+    seconds = [row["wall_seconds"] for row in files.read_rows(run_dir / "metrics.csv")]
     assert seconds == sorted(seconds)
     best = max(undisturbed[1], key=lambda row: row["eval/return"])
     restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT), "best")
@@ -231,9 +233,9 @@ def test_a_killed_run_resumes_to_the_same_end(undisturbed, tmp_path, monkeypatch
             raise Killed
         rows_written.append(append_row(path, row))
 
-    append_row, run_dir = reporting.append_row, tmp_path / "run"
+    append_row, run_dir = files.append_row, tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(reporting, "append_row", append_half_a_row)
+        patch.setattr(files, "append_row", append_half_a_row)
         patch.setattr(Recorder, "close", lambda self: self._checkpoints and self._checkpoints.close())
         options = OPTIONS | {"checkpoint_seconds": checkpoint_seconds}
         with pytest.raises(Killed):
@@ -244,7 +246,7 @@ def test_a_killed_run_resumes_to_the_same_end(undisturbed, tmp_path, monkeypatch
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_after_a_checkpoint(undisturbed, tmp_path, monkeypatch, number):
     run_dir, handlers = tmp_path / "run", [signal.getsignal(number)]
-    append_row = reporting.append_row
+    append_row = files.append_row
 
     def interrupted(path, row):
         append_row(path, row)
@@ -252,7 +254,7 @@ def test_a_signal_ends_the_run_after_a_checkpoint(undisturbed, tmp_path, monkeyp
             signal.raise_signal(number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(reporting, "append_row", interrupted)
+        patch.setattr(files, "append_row", interrupted)
         state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, **(OPTIONS | {"checkpoint_seconds": 1e9}))
     assert 0 < int(state.update) < NUM_UPDATES
     assert signal.getsignal(number) == handlers[0]
@@ -295,7 +297,7 @@ def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkp
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 def test_the_curve_grows_during_training(tmp_path, monkeypatch):
     monkeypatch.setattr(recording, "SECONDS_PER_CURVE", 0.0)
     curve, sizes = tmp_path / "run" / "curve.png", []

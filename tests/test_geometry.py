@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxswarm.geometry import Plane, Torus, bearing, direction, norm, unit
+from jaxswarm.physics.geometry import Plane, Torus, bearing, direction, norm, unit
 
 SIDE = 100.0
 SPACES = [Plane(SIDE), Torus(SIDE)]

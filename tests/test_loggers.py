@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from jaxswarm.config import ConfigError
-from jaxswarm.loggers import LOGGERS
+from jaxswarm.host.loggers import LOGGERS
 
 ROWS = [
     {"update": 0, "agent_steps": 0, "wall_seconds": 0.5, "seed": 3, "eval/return": -9.0, "learner/loss": math.nan},
@@ -64,7 +64,7 @@ def test_weights_and_biases_works_offline(tmp_path, monkeypatch):
     for name, value in {"WANDB_MODE": "offline", "WANDB_ERROR_REPORTING": "false", "HOME": str(tmp_path)}.items():
         monkeypatch.setenv(name, value)
     run_dir = tmp_path / "run"
-    loggers = [LOGGERS["wandb"](run_dir, {"num_worlds": 32}, seed) for seed in (3, 4)]
+    loggers = [LOGGERS["wandb"](run_dir, {"num_envs": 32}, seed) for seed in (3, 4)]
     for row in ROWS:
         loggers[0].log(row)
     for logger in loggers:

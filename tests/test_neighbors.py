@@ -1,4 +1,4 @@
-"""Neighbours found through a grid of cells are those found among all pairs."""
+"""Neighbors found through a grid of cells are those found among all pairs."""
 
 import functools
 
@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxswarm.geometry import Plane, Torus
-from jaxswarm.neighbors import neighborhood
+from jaxswarm.physics.geometry import Plane, Torus
+from jaxswarm.physics.neighbors import neighborhood
 
 ROOM = 30
 SIDE = 10.0

@@ -16,7 +16,7 @@ POLICY_CASES = list(cases("policy.npz"))
 ARCHITECTURES = {
     "simple": {"encoder": (64,), "decoder": (64,)},
     "medium": {"encoder": (120, 60), "decoder": (160,)},
-    "optimised": {"encoder": (146, 120), "decoder": (19, 177, 162), "activation": "tanh"},
+    "optimized": {"encoder": (146, 120), "decoder": (19, 177, 162), "activation": "tanh"},
     "attentive": {"encoder": (72,), "decoder": (132, 200)},
     "single space": {"encoder": (120, 60), "decoder": (160,), "latent_space": "shared"},
 }
@@ -70,8 +70,8 @@ def test_outputs_of_recorded_weights(meta, arrays):
         ("simple", rendezvous_like, "bayesian", {}, 11_461),
         ("medium", rendezvous_like, "mean", {}, 37_645),
         ("medium", rendezvous_like, "bayesian", {}, 52_405),
-        ("optimised", rendezvous_like, "mean", {}, 107_863),
-        ("optimised", rendezvous_like, "bayesian", {}, 143_623),
+        ("optimized", rendezvous_like, "mean", {}, 107_863),
+        ("optimized", rendezvous_like, "bayesian", {}, 143_623),
         ("medium", pursuit_like, "max", {}, 70_965),
         ("medium", pursuit_like, "bayesian", {"output_variance": True}, 138_885),
         ("single space", pursuit_like, "bayesian", {}, 81_045),
@@ -95,7 +95,7 @@ def test_initial_weights_are_orthogonal_with_the_documented_gains():
 
     for tower in (tree["actor"], tree["critic"]):
         encoder = tower["neighbors_encoder"]
-        assert encoder["kernel"].shape == (8, 12)  # both parts of a message, initialised as one matrix
+        assert encoder["kernel"].shape == (8, 12)  # both parts of a message, initialized as one matrix
         for kernel in (encoder["Dense_0"]["kernel"], encoder["kernel"], tower["Dense_0"]["kernel"]):
             assert gain(kernel) == pytest.approx(np.sqrt(2), rel=1e-4)
         np.testing.assert_array_equal(tower["neighbors_aggregator"]["prior_variance"], 1.0)

@@ -9,7 +9,7 @@ import pytest
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 REPOSITORY = "https://github.com/jaxswarm/jaxswarm"
 COLAB = f"https://colab.research.google.com/github/{REPOSITORY.removeprefix('https://github.com/')}/blob/main/notebooks"
-SMALL = {"num_agents": 3, "episode_length": 6, "num_updates": 2, "num_worlds": 2}
+SMALL = {"num_agents": 3, "episode_length": 6, "num_updates": 2, "num_envs": 2}
 TINY = {  # what the cell of parameters is replaced by
     "quickstart": SMALL,
     "compare_aggregators": SMALL | {"aggregators": ("max",), "num_seeds": 2},
@@ -84,7 +84,7 @@ def test_links_between_notebooks_lead_somewhere(name):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 def test_notebooks_run(name, tmp_path, monkeypatch):
     client = pytest.importorskip("nbclient")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")

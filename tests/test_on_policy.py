@@ -103,11 +103,11 @@ def test_every_sample_is_as_likely_in_every_minibatch(rows, columns):
     order = jax.jit(jax.vmap(lambda key: on_policy.shuffled(key, rows, columns)))(keys).reshape(num_draws, -1)
     minibatch = np.argsort(np.asarray(order), axis=1) // columns  # of each sample
     assert np.abs((minibatch == 0).mean(0) - 1 / rows).max() < 5 / np.sqrt(rows * num_draws)
-    together = (minibatch[:, :1] == minibatch).mean(0)[1:]  # with sample 0: neighbours are no more alike than others
+    together = (minibatch[:, :1] == minibatch).mean(0)[1:]  # with sample 0: neighbors are no more alike than others
     assert np.abs(together - (columns - 1) / (rows * columns - 1)).max() < 5 / np.sqrt(rows * num_draws)
 
 
-def random_trajectory(task, num_steps=6, num_worlds=3, std="shared"):
+def random_trajectory(task, num_steps=6, num_envs=3, std="shared"):
     network = ActorCritic(
         encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["mean"](), std=std, action_dim=task.action_dim
     )
@@ -115,7 +115,7 @@ def random_trajectory(task, num_steps=6, num_worlds=3, std="shared"):
     @jax.jit
     def play():
         params = network.init(jax.random.key(0), task.observe(task.reset(jax.random.key(0))))
-        worlds = rollout.start(jax.random.key(1), task, num_worlds, is_desynchronised=False)
+        worlds = rollout.start(jax.random.key(1), task, num_envs, is_desynchronized=False)
         policy = partial(network.apply, params, method="policy")
         _, trajectory, metrics = rollout.collect(jax.random.key(2), task, policy, worlds, num_steps, reset_pool=2)
         return params, trajectory, metrics
@@ -145,7 +145,7 @@ def test_fetched_samples_are_those_of_the_trajectory():
     np.testing.assert_array_equal(batch.log_prob, trajectory.log_prob.reshape(-1)[jnp.array([5, 0, 33])])
     obs = jax.vmap(jax.vmap(task.observe))(trajectory.state)
     np.testing.assert_allclose(batch.obs.own[2], obs.own.reshape(-1, 2)[33])
-    batch = on_policy.fetch_worlds(task, samples, jnp.array([7, 2]))
+    batch = on_policy.fetch_envs(task, samples, jnp.array([7, 2]))
     np.testing.assert_array_equal(batch.target, [-14, -15, -4, -5])
     np.testing.assert_allclose(batch.obs.groups["neighbors"].features[1, 0], obs.own[2, 1, 0])
 
@@ -183,13 +183,13 @@ def test_statistics_are_those_of_the_rows_that_exist():
     mask = rng.random(20) < 0.5
     kept, kept_y = x[mask], y[mask]
     expected = (kept - kept.mean()) / kept.std(ddof=1)
-    np.testing.assert_allclose(on_policy.standardised(jnp.array(x), jnp.array(mask))[mask], expected, atol=1e-5)
+    np.testing.assert_allclose(on_policy.standardized(jnp.array(x), jnp.array(mask))[mask], expected, atol=1e-5)
     np.testing.assert_allclose(on_policy.mean(jnp.array(x), jnp.array(mask)), kept.mean(), atol=1e-6)
     np.testing.assert_allclose(on_policy.maximum(jnp.array(x**2), jnp.array(mask)), (kept**2).max())
     explained = on_policy.explained_variance(jnp.array(x), jnp.array(y), jnp.array(mask))
     np.testing.assert_allclose(explained, 1 - (kept_y - kept).var() / kept_y.var(), rtol=1e-5)
     everywhere = np.ones(20, bool)
-    for function in (on_policy.standardised, on_policy.mean):
+    for function in (on_policy.standardized, on_policy.mean):
         np.testing.assert_allclose(
             function(jnp.array(x), None), function(jnp.array(x), jnp.array(everywhere)), atol=1e-6
         )
@@ -223,7 +223,7 @@ def test_impossible_hyper_parameters_are_named(learner):
         "discount": 1.5,
         "num_epochs": 0,
         "batch_size": 0,
-        "minibatch": "x",
+        "sampling_unit": "x",
         "bootstrap_truncation": "false",
     }.items():
         with pytest.raises(ValueError, match=f"{field} = {value!r} is not possible; accepted: "):

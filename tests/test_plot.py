@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from jaxswarm import config as configs
-from jaxswarm import plots, reporting
+from jaxswarm import files
+from jaxswarm.analysis import plots
+from jaxswarm.analysis.curves import Line
 from jaxswarm.cli import plot
-from jaxswarm.curves import Line
 
 SEEDS = {  # returns of the evaluations at 0, 500, 1000, ... agent steps
     "mean": {0: [-9.0, -5.0, -1.0], 1: [-8.0, -3.0, -2.0], 2: [-7.0, -6.0]},
@@ -28,7 +29,7 @@ def runs(tmp_path_factory):
             for i, value in enumerate(values):
                 row = {"update": i, "agent_steps": i * 500, "wall_seconds": i + seed / 8, "seed": seed}
                 row |= {"eval/return": value, "learner/policy_loss": 1 / i if i else math.nan}
-                reporting.append_row(path / name / "metrics.csv", row)
+                files.append_row(path / name / "metrics.csv", row)
     return path
 
 
@@ -65,14 +66,14 @@ def test_a_picture_of_a_folder_of_runs_says_how_many_seeds_and_what_the_band_is(
         "wrote a/b.csv",
     ]
     assert not err
-    words = text_of("a/b.svg")
+    overrides = text_of("a/b.svg")
     expected = [
         "aggregator=mean (3 seeds, 2 at the end)",
         "aggregator=max (2 seeds)",
         "Median and quartiles over seeds",
     ]
     expected += ["rendezvous, ppo", "return of an episode", "thousand agent steps", "pale where not all seeds"]
-    assert all(text in words for text in expected), words
+    assert all(text in overrides for text in expected), overrides
 
 
 def test_the_table_holds_what_is_drawn(runs):
@@ -114,13 +115,13 @@ def test_a_previous_picture_is_replaced(runs, tmp_path):
 
 
 def test_the_interquartile_mean_over_the_time_with_logarithmic_axes(runs, capsys):
-    words = ["statistic=iqm", "x=wall_seconds", "log=xy", "smooth=2", "title=What $ is_seen"]
-    assert plot.main([str(runs), *words, "out=x.svg"]) == 0
+    overrides = ["statistic=iqm", "x=wall_seconds", "log=xy", "smooth=2", "title=What $ is_seen"]
+    assert plot.main([str(runs), *overrides, "out=x.svg"]) == 0
     assert "no place for wall_seconds = 0; points left out: 1" in capsys.readouterr().err
-    words = text_of("x.svg")
+    overrides = text_of("x.svg")
     expected = ["What $ is_seen", "95 % stratified bootstrap interval", "means of 2 evaluations", "seconds"]
-    assert all(text in words for text in expected), words
-    assert "rendezvous" not in words
+    assert all(text in overrides for text in expected), overrides
+    assert "rendezvous" not in overrides
     rows = [row for row in read("x.csv") if row["series"] == "aggregator=max"]
     assert [float(row["x"]) for row in rows] == [0.625, 0.75, 1.625, 1.75, 2.625, 2.75]
     assert float(rows[1]["y"]) == pytest.approx((-9 + (-9 + 0.125 * 0.5)) / 2)
@@ -140,8 +141,8 @@ def test_a_profile_of_the_last_evaluations(runs):
     points = {float(row["x"]): float(row["y"]) for row in rows}
     assert [points[x] for x in (-6, -4, -3, -2, -1)] == pytest.approx([2 / 3, 2 / 3, 2 / 3, 1 / 3, 0])
     assert max(points.values()) == 1
-    words = text_of("x.svg")
-    assert all(text in words for text in ("at 1,000 agent steps", "the first to end: 500 agent steps")), words
+    overrides = text_of("x.svg")
+    assert all(text in overrides for text in ("at 1,000 agent steps", "the first to end: 500 agent steps")), overrides
 
 
 def test_the_times_to_a_threshold_with_seeds_that_never_got_there(runs, capsys):
@@ -167,13 +168,13 @@ def test_references_are_drawn_with_their_source(runs, reference):
         ("4", "0.0", "-8.0", "-9.0"),
         ("4", "900.0", "-1.0", ""),
     ]
-    words = text_of("x.svg")
-    assert "A (small) (figure, 4 runs)" in words
-    assert "dashed: references, median and quartiles" in words
+    overrides = text_of("x.svg")
+    assert "A (small) (figure, 4 runs)" in overrides
+    assert "dashed: references, median and quartiles" in overrides
 
 
 @pytest.mark.parametrize(
-    ("words", "parts"),
+    ("overrides", "parts"),
     [
         (["kind=pie"], ["kind = 'pie'", "curve, profile, threshold"]),
         (["statistic=mode"], ["statistic = 'mode'", "median, iqm"]),
@@ -201,9 +202,9 @@ def test_references_are_drawn_with_their_source(runs, reference):
         (["out=figure.png"], ["would replace figure.csv"]),
     ],
 )
-def test_a_wrong_command_is_one_line_and_writes_nothing(runs, reference, tmp_path, capsys, words, parts):
-    words = [word.format(reference=reference, runs=runs) for word in words]
-    assert plot.main([str(runs), *words]) == 2
+def test_a_wrong_command_is_one_line_and_writes_nothing(runs, reference, tmp_path, capsys, overrides, parts):
+    overrides = [word.format(reference=reference, runs=runs) for word in overrides]
+    assert plot.main([str(runs), *overrides]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
@@ -238,9 +239,9 @@ def test_evaluations_that_are_not_finite_are_left_out_and_told(runs, tmp_path, c
     assert [row["y"] for row in read("x.csv")] == ["-9.0"]
 
 
-@pytest.mark.parametrize(("words", "count"), [([], 0), (["seeds=true"], 5), (["seeds=true", "smooth=2"], 5)])
-def test_each_seed_is_shown_if_asked_for(runs, words, count):
-    assert plot.main([str(runs), "out=x.svg", *words]) == 0
+@pytest.mark.parametrize(("overrides", "count"), [([], 0), (["seeds=true"], 5), (["seeds=true", "smooth=2"], 5)])
+def test_each_seed_is_shown_if_asked_for(runs, overrides, count):
+    assert plot.main([str(runs), "out=x.svg", *overrides]) == 0
     assert plot.Path("x.svg").read_text().count("stroke-width: 0.6;") == count
     assert ("and each seed" in text_of("x.svg")) == (count > 0)
 
@@ -252,6 +253,6 @@ def test_many_series_share_no_colour_and_marker():
     drawn = []
     original = plots._draw_line
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plots, "_draw_line", lambda *words: (drawn.append(words[-1]), original(*words)))
+        patch.setattr(plots, "_draw_line", lambda *overrides: (drawn.append(overrides[-1]), original(*overrides)))
         plots.draw(plot.Path("many.svg"), picture)
     assert len({(style["color"], style["marker"]) for style in drawn}) == 20

@@ -7,7 +7,7 @@ import pytest
 from golden_weights import cases, network, observation, params, weights
 
 from jaxswarm.learners import on_policy
-from jaxswarm.learners.on_policy import Batch
+from jaxswarm.learners.on_policy import Minibatch
 from jaxswarm.learners.ppo import PPO
 
 AGGREGATION = {
@@ -62,7 +62,7 @@ def test_recorded_update(meta, arrays):
         clip_range=meta["clip_range"],
         value_coefficient=meta["vf_coef"],
         entropy_coefficient=meta["ent_coef"],
-        max_gradient_norm=meta["max_grad_norm"],
+        max_grad_norm=meta["max_grad_norm"],
         adam_epsilon=meta["adam_eps"],
         num_epochs=meta["n_epochs"],
         batch_size=meta["batch_size"],
@@ -74,7 +74,7 @@ def test_recorded_update(meta, arrays):
         return jnp.asarray(x).reshape(-1, *x.shape[2:])
 
     obs = jax.tree.map(flat, observation(meta, arrays["obs"]))
-    batch = Batch(obs, *[flat(arrays[name]) for name in ("actions", "log_probs", "advantages", "returns")])
+    batch = Minibatch(obs, *[flat(arrays[name]) for name in ("actions", "log_probs", "advantages", "returns")])
 
     @jax.jit
     def update(state):

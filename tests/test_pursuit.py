@@ -118,7 +118,7 @@ def test_recorded_observations_are_reproduced(case):
     sizes = [num_local, num_local + 6 * (num_agents - 1)]
     own, neighbors, evaders = np.split(record(case, "obs"), sizes, axis=-1)
     np.testing.assert_allclose(obs.own, own, atol=1e-6)
-    # Recorded rows stand in the order of their index, visible ones first; neighbours of ours in cyclic order.
+    # Recorded rows stand in the order of their index, visible ones first; neighbors of ours in cyclic order.
     cyclic = (np.arange(num_agents)[:, None] + np.arange(1, num_agents)) % num_agents
     in_order = np.broadcast_to(np.arange(case["n_evaders"]), (num_agents, case["n_evaders"]))
     for group, rows, index, radius in (

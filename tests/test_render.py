@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from films import episode
+from example_films import episode
 from PIL import Image
 
 from jaxswarm import config as configs
@@ -203,19 +203,19 @@ def test_runs_are_rendered_side_by_side(run_dir, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "part"),
+    ("overrides", "part"),
     [
         (["out=a.jpg"], "accepted: names that end in .html"),
         (["checkpoint=first"], "accepted: best, last"),
         (["frames=0", "out=a.png"], "frames = 0"),
         (["frames=3"], "frames is not possible for .html"),
-        (["num_worlds=3"], "num_worlds cannot be changed here"),
+        (["num_envs=3"], "num_envs cannot be changed here"),
         (["task.dynamics=velocity"], "observations of other sizes"),
         (["nowhere"], "nowhere is not a run folder"),
     ],
 )
-def test_a_wrong_command_is_one_line(run_dir, capsys, words, part):
-    assert program.main([str(run_dir), *words]) == 2
+def test_a_wrong_command_is_one_line(run_dir, capsys, overrides, part):
+    assert program.main([str(run_dir), *overrides]) == 2
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1

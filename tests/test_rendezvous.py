@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxswarm.geometry import bearing, direction, norm, unit
-from jaxswarm.neighbors import Neighborhood
+from jaxswarm.physics.geometry import bearing, direction, norm, unit
+from jaxswarm.physics.neighbors import Neighborhood
 from jaxswarm.tasks.rendezvous import Rendezvous, State
 
 GOLDEN = np.load(pathlib.Path(__file__).parent / "golden" / "rendezvous.npz")
@@ -114,7 +114,7 @@ def test_recorded_episodes_are_reproduced(case):
 
 @golden_cases
 def test_recorded_observations_are_reproduced(case):
-    """Bearings to neighbours closer than a unit may be off by as much more as float32 positions are coarser there."""
+    """Bearings to neighbors closer than a unit may be off by as much more as float32 positions are coarser there."""
     every, num_local, num_agents = case["obs_every"], case["n_local"], case["n_agents"]
     obs = observations(recorded_task(case), recorded_states(case), every)
     own, rows = np.split(record(case, "obs"), [num_local], axis=-1)
@@ -122,7 +122,7 @@ def test_recorded_observations_are_reproduced(case):
     neighbors = obs.groups["neighbors"]
     features, mask = np.asarray(neighbors.features), np.asarray(neighbors.mask)
 
-    # Recorded neighbours stand in the order of their index, visible ones first; ours in cyclic order from the agent on.
+    # Recorded neighbors stand in the order of their index, visible ones first; ours in cyclic order from the agent on.
     index = (np.arange(num_agents)[:, None] + np.arange(1, num_agents)) % num_agents
     order = np.argsort(np.where(mask, index, num_agents), axis=-1, kind="stable")
     features, mask = np.take_along_axis(features, order[..., None], 2), np.take_along_axis(mask, order, 2)
@@ -140,11 +140,11 @@ def test_recorded_observations_are_reproduced(case):
 def test_relative_velocities_of_the_thesis_are_100_times_the_normalised():
     task = Rendezvous(num_agents=4)
     state = task.reset(KEY).replace(velocity=jax.random.normal(KEY, (4, 2)))
-    normalised, thesis = (
+    normalized, thesis = (
         np.asarray(observe(task.replace(relative_velocity=scale), state).groups["neighbors"].features)
-        for scale in ("normalised", "thesis")
+        for scale in ("normalized", "thesis")
     )
-    np.testing.assert_allclose(thesis, normalised * np.where(np.isin(range(8), (5, 6)), 100, 1), rtol=1e-5)
+    np.testing.assert_allclose(thesis, normalized * np.where(np.isin(range(8), (5, 6)), 100, 1), rtol=1e-5)
 
 
 def test_two_agents_see_each_other_as_the_formulas_say():
@@ -283,7 +283,7 @@ def test_driving_to_the_first_centroid_scores_ten_to_sixteen():
         ("visibility_radius", float("nan"), "positive finite numbers"),
         ("visibility_radius", float("inf"), "positive finite numbers"),
         ("dynamics", "unicycle", "acceleration, velocity"),
-        ("relative_velocity", "times 5", "normalised, thesis"),
+        ("relative_velocity", "times 5", "normalized, thesis"),
         ("torus", "yes", "True, False"),
         ("torus", 1, "True, False"),
     ],

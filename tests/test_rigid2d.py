@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from overlaps import HALF, RADIUS, overlaps
 
-from jaxswarm import rigid2d
-from jaxswarm.contacts import BOX_INERTIA, BOX_MASS, MAX_SPEED, Offsets, Solver
+from jaxswarm.physics import rigid2d
+from jaxswarm.physics.contacts import BOX_INERTIA, BOX_MASS, MAX_SPEED, Offsets, Solver
 from jaxswarm.tasks.boxes import State
 
 GOLDEN = json.loads((pathlib.Path(__file__).parent / "golden" / "boxes.json").read_text())
@@ -265,8 +265,8 @@ def test_one_world_moves_as_among_many():
 @pytest.mark.slow
 def test_more_worlds_than_a_block_move_as_few():
     start, command = crowd()
-    num_worlds = rigid2d.BLOCK + 3
-    states, commands_of_all = (jax.tree.map(lambda x: jnp.stack([x] * num_worlds), x) for x in (start, command))
+    num_envs = rigid2d.BLOCK + 3
+    states, commands_of_all = (jax.tree.map(lambda x: jnp.stack([x] * num_envs), x) for x in (start, command))
     among = replay_worlds(FAITHFUL, jnp.float32(0.5), states, commands_of_all)
     alone = replay(FAITHFUL, jnp.float32(0.5), start, command)
     for name in ("position", "box_position", "box_heading"):
@@ -361,7 +361,7 @@ def test_settling_parts_whatever_overlaps():
 @pytest.mark.parametrize(
     ("discs", "boxes"),
     [
-        ([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.4]]),  # a disc at the centre of a box
+        ([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.4]]),  # a disc at the center of a box
         ([[0.3, 0.0, 0.0]], [[0.0, 0.0, 0.4], [0.0, 0.0, 0.4]]),  # two boxes at one place
         ([[0.3, 0.0, 0.0], [0.3, 0.0, 0.0]], []),  # two discs at one place
         ([[0.3, 0.0, 0.0]], [[0.5, 0.1, 0.4]]),  # a box half through a wall

@@ -49,7 +49,7 @@ def policy(mean):
 
 @pytest.fixture(scope="module")
 def collected():
-    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronised=False)
+    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronized=False)
     return rollout.collect(jax.random.key(1), Ticking(), policy(0.0), worlds, 10, reset_pool=2)
 
 
@@ -72,7 +72,7 @@ def test_only_whole_episodes_are_counted(collected):
     assert metrics["episodes"] == 6
     np.testing.assert_allclose(metrics["return"], 4.0, rtol=1e-5)
     np.testing.assert_allclose(metrics["episode_length"], 4.0)
-    worlds = rollout.start(jax.random.key(0), Ticking(), 50, is_desynchronised=True)
+    worlds = rollout.start(jax.random.key(0), Ticking(), 50, is_desynchronized=True)
     _, trajectory, metrics = rollout.collect(jax.random.key(1), Ticking(), policy(0.0), worlds, 4, reset_pool=1)
     assert trajectory.truncated.sum() == 50
     assert metrics["episodes"] == (worlds.state.time == 0).sum() * 0  # those began at an unknown time
@@ -87,7 +87,7 @@ def test_episodes_go_on_across_rollouts(collected):
 
 
 def test_actions_are_clipped_for_the_world_only():
-    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronised=False)
+    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronized=False)
     _, trajectory, _ = rollout.collect(jax.random.key(1), Ticking(), policy(3.0), worlds, 2, reset_pool=1)
     np.testing.assert_allclose(trajectory.action, 3.0, rtol=1e-5)
     np.testing.assert_allclose(trajectory.reward, 2.0)

@@ -10,8 +10,9 @@ from flax import linen as nn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxswarm import AGGREGATORS, sets
-from jaxswarm.networks import Beside, Encoder
+from jaxswarm import AGGREGATORS
+from jaxswarm.aggregators import sets
+from jaxswarm.networks import Encoder, ParallelEncoders
 from jaxswarm.types import Entities
 
 WIDTH, DIM, SLOTS, RECEIVERS = 4, 3, (4, 2), 5
@@ -32,7 +33,7 @@ class Groups(nn.Module):
     def __call__(self, groups, own):
         is_raw = self.aggregator.num_encoders == 0
         encoders = [Encoder((WIDTH,), "tanh", self.aggregator.num_parts, name=name) for name in ("one", "two")]
-        encoders = [Beside(()) if is_raw else encoder for encoder in encoders]
+        encoders = [ParallelEncoders(()) if is_raw else encoder for encoder in encoders]
         aggregator = self.aggregator.copy(name="pooling")
         return sets.Pool(aggregator, tuple(encoders), DIM if is_raw else WIDTH, self.layout)(groups, own)
 

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 from test_cli import TINY
 
-from jaxswarm import config, fit, reporting, search, sweep, trials
+from jaxswarm import config, files
 from jaxswarm.cli import evaluate
 from jaxswarm.cli import sweep as program
 from jaxswarm.config import ConfigError
+from jaxswarm.host import fit
 from jaxswarm.learners.on_policy import batch_size
+from jaxswarm.studies import grid as sweep
+from jaxswarm.studies import search, trials
 
-WORDS = [*TINY, "num_updates=4", "num_seeds=2"]
-SWEPT = [*WORDS, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu", "render_every=1"]
+OVERRIDES = [*TINY, "num_updates=4", "num_seeds=2"]
+SWEPT = [*OVERRIDES, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu", "render_every=1"]
 
 
 @pytest.mark.parametrize(
@@ -53,11 +56,11 @@ def test_what_fixes_a_shape_has_a_program_of_its_own(tmp_path):
 
 def test_equal_runs_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="the same"):
-        sweep.trials(sweep.expand([*WORDS, "seed=1,2"]), tmp_path)
+        sweep.trials(sweep.expand([*OVERRIDES, "seed=1,2"]), tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, capsys):
     sweep_dir, begun = tmp_path / "sweep", []
     real = trials.fit_runs
@@ -81,17 +84,17 @@ def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, 
     assert (sweep_dir / "curves.png").stat().st_size > 10_000
     folders = sorted(path for path in sweep_dir.iterdir() if path.is_dir())
     for folder in folders:
-        rows = reporting.read_rows(folder / "metrics.csv")
+        rows = files.read_rows(folder / "metrics.csv")
         assert [(row["update"], row["seed"]) for row in rows] == [(u, s) for u in (0, 3, 4) for s in (5, 6)]
         assert {path.name for path in folder.glob("replay-*.html")} == {"replay-0.html", "replay-3.html"}
     before = {path: path.read_bytes() for path in folders[1].rglob("*") if path.is_file()}
     shutil.rmtree(folders[0])
     assert program.main([f"resume={sweep_dir}"]) == 0  # trains what is missing, and leaves what is beside it
-    assert len(reporting.read_rows(folders[0] / "metrics.csv")) == 6
+    assert len(files.read_rows(folders[0] / "metrics.csv")) == 6
     assert {path: path.read_bytes() for path in folders[1].rglob("*") if path.is_file()} == before
     alone = config.load(folders[3] / "config.yaml")
     _, expected = fit.fit(config.build(alone), 4, seed=6, progress=False)
-    found = [row["eval/return"] for row in reporting.read_rows(folders[3] / "metrics.csv") if row["seed"] == 6]
+    found = [row["eval/return"] for row in files.read_rows(folders[3] / "metrics.csv") if row["seed"] == 6]
     np.testing.assert_allclose(found, [row["eval/return"] for row in expected], rtol=1e-5)
     assert evaluate.main([str(folders[0]), "episodes=2"]) == 0
     assert "of each of 2 seeds" in capsys.readouterr().out
@@ -108,7 +111,7 @@ def test_a_seed_that_diverges_counts_with_its_worst():
 
 
 def test_what_diverged_counts_as_evaluated_to_its_end(tmp_path, monkeypatch):
-    (trial,) = sweep.trials(sweep.expand([*WORDS, "num_updates=7"]), tmp_path)
+    (trial,) = sweep.trials(sweep.expand([*OVERRIDES, "num_updates=7"]), tmp_path)
     assert trial.num_evaluations == 4  # before updates 0, 3, 6, and after the last
     rows = [[{"update": 0, "seed": 1, "eval/return": -6.0}]]
 
@@ -137,7 +140,7 @@ def test_processes_that_search_together_draw_different_settings(tmp_path):
 
 
 def test_runs_with_seeds_that_diverged_come_last():
-    wanted = config.compose(WORDS)
+    wanted = config.compose(OVERRIDES)
 
     def trial(number):
         return trials.Trial(wanted, config.build(wanted), Path(f"run{number}"))
@@ -216,24 +219,24 @@ def test_impossible_spaces_are_errors(tmp_path, text, message):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_optimisations")
+@pytest.mark.usefixtures("few_optimizations")
 def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, monkeypatch, capsys):
     pytest.importorskip("optuna")
     (tmp_path / "space.yaml").write_text(SPACE)
     storage = tmp_path / "journal.log"
-    words = [*WORDS, f"search={tmp_path / 'space.yaml'}", "trials=3", f"storage={storage}"]
-    words = [word for word in words if "batch_size" not in word]
+    overrides = [*OVERRIDES, f"search={tmp_path / 'space.yaml'}", "trials=3", f"storage={storage}"]
+    overrides = [word for word in overrides if "batch_size" not in word]
     real = trials.fit_runs
     with monkeypatch.context() as patch:
         patch.setattr(trials, "fit_runs", lambda runs, num_updates, **options: real(runs, 2, **options))
-        assert program.main([*words, f"sweep_dir={tmp_path / 'one'}"]) == 0
+        assert program.main([*overrides, f"sweep_dir={tmp_path / 'one'}"]) == 0
     assert "stopped; continue with" in capsys.readouterr().out
-    assert program.main([*words, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over
+    assert program.main([*overrides, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over
     study = search.open_study(str(storage))
     complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
     assert len(complete) == 3
     first = next(trial for trial in complete if Path(trial.user_attrs["run_dir"]).parent.name == "one")
-    rows = reporting.read_rows(Path(first.user_attrs["run_dir"]) / "metrics.csv")
+    rows = files.read_rows(Path(first.user_attrs["run_dir"]) / "metrics.csv")
     assert first.value == pytest.approx(np.mean([row["eval/return"] for row in rows]), rel=1e-6)
     assert {row["update"] for row in rows} == {0, 3, 4}
     assert json.loads((tmp_path / "two" / "sweep.json").read_text())["options"]["trials"] == "3"

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import jaxswarm
-from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment, reporting
+from jaxswarm import AGGREGATORS, LEARNERS, ActorCritic, Experiment
+from jaxswarm.host import manifest
 from jaxswarm.learners.on_policy import LearnerState
 from jaxswarm.training import train_chunk
 from jaxswarm.types import pytree
@@ -17,7 +18,7 @@ from jaxswarm.types import pytree
 TASK = jaxswarm.make("rendezvous", num_agents=3, episode_length=6)
 NETWORK = ActorCritic(encoder=(4,), decoder=(4,), aggregator=AGGREGATORS["bayesian"]())
 LEARNER = LEARNERS["ppo"](num_epochs=2, batch_size=12)
-SIZES = {"num_worlds": 2, "num_steps": 4, "eval_worlds": 2, "eval_every": 2}
+SIZES = {"num_envs": 2, "num_steps": 4, "num_eval_envs": 2, "eval_every": 2}
 EXPERIMENT = Experiment(TASK, NETWORK, LEARNER, **SIZES)
 init = jax.jit(jaxswarm.init)
 
@@ -113,11 +114,11 @@ def test_every_number_that_fixes_no_shape_can_be_swept():
     assert not np.allclose(params[0], params[1])
 
 
-@pytest.mark.parametrize("minibatch", ["agents", "worlds"])
-def test_a_swarm_of_one_trains(minibatch):
+@pytest.mark.parametrize("sampling_unit", ["agents", "envs"])
+def test_a_swarm_of_one_trains(sampling_unit):
     task = jaxswarm.make("pursuit", num_agents=1, episode_length=5)
-    learner = LEARNERS["ppo"](minibatch=minibatch, batch_size=4)
-    experiment = Experiment(task, NETWORK, learner, num_worlds=2, num_steps=4, eval_worlds=2)
+    learner = LEARNERS["ppo"](sampling_unit=sampling_unit, batch_size=4)
+    experiment = Experiment(task, NETWORK, learner, num_envs=2, num_steps=4, num_eval_envs=2)
     state = jax.eval_shape(jaxswarm.init, experiment, jax.random.key(0))
     _, metrics = jax.eval_shape(partial(jaxswarm.train, num_updates=1), experiment, state)
     assert metrics["eval/return"].shape == (1,)
@@ -126,10 +127,10 @@ def test_a_swarm_of_one_trains(minibatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"num_worlds": 0}, r"num_worlds = 0 is not possible; accepted: whole numbers from 1"),
+        ({"num_envs": 0}, r"num_envs = 0 is not possible; accepted: whole numbers from 1"),
         ({"num_steps": 2.5}, r"num_steps = 2.5 is not possible"),
         ({"eval_every": -1}, r"eval_every = -1 is not possible"),
-        ({"desynchronised_start": "no"}, r"desynchronised_start = 'no' is not possible; accepted: True, False"),
+        ({"desynchronized_start": "no"}, r"desynchronized_start = 'no' is not possible; accepted: True, False"),
         ({"learner": "ppo"}, r"learner = 'ppo' is not possible; accepted: objects with `update`"),
         ({"task": jaxswarm.TASKS["pursuit"]}, r"task = .* is not possible; accepted: objects with `reset`"),
         ({"network": ActorCritic(action_dim=3)}, r"action_dim = 3 is not possible in Rendezvous; accepted: 2"),
@@ -139,7 +140,7 @@ def test_a_swarm_of_one_trains(minibatch):
         ),
         ({"learner": LEARNER.replace(batch_size=8)}, r"batch_size = 8 .* for instance 3, 6, 12, 24"),
         ({"learner": LEARNER.replace(batch_size=48)}, r"batch_size = 48 "),
-        ({"learner": LEARNER.replace(batch_size=9, minibatch="agents")}, r"batch_size = 9 .* multiples of 1"),
+        ({"learner": LEARNER.replace(batch_size=9, sampling_unit="agents")}, r"batch_size = 9 .* multiples of 1"),
     ],
 )
 def test_impossible_sizes_are_named(changes, message):
@@ -148,14 +149,12 @@ def test_impossible_sizes_are_named(changes, message):
 
 
 def test_more_samples_than_can_be_numbered_are_an_error():
-    with pytest.raises(
-        ValueError, match=r"num_worlds \* num_steps \* num_agents = \d+ is not possible; accepted: up to"
-    ):
-        EXPERIMENT.replace(num_worlds=2**20, num_steps=2**20)
+    with pytest.raises(ValueError, match=r"num_envs \* num_steps \* num_agents = \d+ is not possible; accepted: up to"):
+        EXPERIMENT.replace(num_envs=2**20, num_steps=2**20)
 
 
 def test_every_episode_of_an_update_has_a_start_of_its_own():
-    assert [EXPERIMENT.replace(num_steps=n, num_worlds=12 // n).num_start_states for n in (4, 6, 12)] == [1, 1, 2]
+    assert [EXPERIMENT.replace(num_steps=n, num_envs=12 // n).num_start_states for n in (4, 6, 12)] == [1, 1, 2]
     assert EXPERIMENT.replace(reset_pool=5).num_start_states == 5
     with pytest.raises(ValueError, match="reset_pool = 0 is not possible; accepted: null, whole numbers from 1"):
         EXPERIMENT.replace(reset_pool=0)
@@ -177,17 +176,17 @@ def test_a_learner_needs_no_more_than_init_and_update():
     state, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 2)
     assert int(state.update) == 2
     assert np.isfinite(metrics["learner/loss"]).all()
-    assert "gradient_steps" not in reporting.manifest(experiment, 2, [0])["steps"]
+    assert "gradient_steps" not in manifest.describe(experiment, 2, [0])["steps"]
 
 
 @pytest.mark.slow
 def test_desynchronised_worlds_start_at_random_times():
     experiment = Experiment(
-        TASK.replace(episode_length=1000), NETWORK, LEARNER, **SIZES | {"num_worlds": 50, "num_steps": 12}
+        TASK.replace(episode_length=1000), NETWORK, LEARNER, **SIZES | {"num_envs": 50, "num_steps": 12}
     )
-    assert len(np.unique(init(experiment, jax.random.key(0)).worlds.state.time)) > 40
-    experiment = experiment.replace(desynchronised_start=False)
-    np.testing.assert_array_equal(init(experiment, jax.random.key(0)).worlds.state.time, 0)
+    assert len(np.unique(init(experiment, jax.random.key(0)).envs.state.time)) > 40
+    experiment = experiment.replace(desynchronized_start=False)
+    np.testing.assert_array_equal(init(experiment, jax.random.key(0)).envs.state.time, 0)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import jaxswarm
 from jaxswarm import LEARNERS, Experiment
 from jaxswarm.distributions import gaussian_with_std
 from jaxswarm.learners import on_policy
-from jaxswarm.learners.on_policy import Batch
+from jaxswarm.learners.on_policy import Minibatch
 from jaxswarm.learners.trl import TRL
 from jaxswarm.types import Observation
 
@@ -34,13 +34,13 @@ class Outputs:
 
 @partial(jax.jit, static_argnums=1)
 def loss_and_gradient(learner, std, params, batch, least_entropy=NO_TARGET):
-    """With the advantages as they are, as the recorded losses do not standardise them."""
+    """With the advantages as they are, as the recorded losses do not standardize them."""
 
     def loss(params):
         return learner.loss(Outputs(std), params, batch, least_entropy)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(on_policy, "standardised", lambda advantage, mask: advantage)
+        patch.setattr(on_policy, "standardized", lambda advantage, mask: advantage)
         (total, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
     return total, metrics, gradient
 
@@ -52,14 +52,16 @@ def recorded_batch(meta):
     action = jnp.pad(jnp.asarray(recorded["act"]), ((0, 0), (0, mean.shape[1] - meta["dim"])))
     log_prob = gaussian_with_std(old_mean, old_std).log_prob(action)
     obs = Observation(jnp.zeros((NUM_ROWS, 0)), {})
-    batch = Batch(obs, action, log_prob, jnp.asarray(recorded["adv"]), jnp.zeros(NUM_ROWS), old_mean, old_std)
+    batch = Minibatch(obs, action, log_prob, jnp.asarray(recorded["adv"]), jnp.zeros(NUM_ROWS), old_mean, old_std)
     params = {"mean": mean, "std": std[:1] if meta["is_shared"] else std}
     return recorded, params, batch, {"mean_bound": mean_bound, "cov_bound": cov_bound}
 
 
 def recorded_losses(meta, coefficient, objective="projected"):
     recorded, params, batch, bounds = recorded_batch(meta)
-    learner = TRL(projection=meta["projection"], objective=objective, coefficient=jnp.float32(coefficient), **bounds)
+    learner = TRL(
+        projection=meta["projection"], objective=objective, regression_coefficient=jnp.float32(coefficient), **bounds
+    )
     total, metrics, gradient = loss_and_gradient(learner, "shared" if meta["is_shared"] else "state", params, batch)
     assert float(total) == pytest.approx(float(metrics["policy_loss"] + metrics["regression_loss"]), rel=1e-6)
     return recorded, metrics, jax.tree.map(lambda x: np.asarray(x)[:, : meta["dim"]], gradient)
@@ -179,7 +181,7 @@ def test_the_entropy_of_the_policy_follows_its_schedule():
         ("objective", "clipped"),
         ("mean_bound", 0.0),
         ("cov_bound", -1.0),
-        ("coefficient", 0.0),
+        ("regression_coefficient", 0.0),
         ("entropy_control", True),
         ("entropy_schedule", "cosine"),
         ("entropy_updates", 0.0),
@@ -197,5 +199,5 @@ def test_the_entropy_of_a_policy_that_is_never_projected_cannot_be_controlled():
 
 
 def test_bounds_and_coefficient_can_be_swept():
-    leaves = jax.tree.leaves(TRL(mean_bound=0.1, cov_bound=0.2, coefficient=0.3))
+    leaves = jax.tree.leaves(TRL(mean_bound=0.1, cov_bound=0.2, regression_coefficient=0.3))
     assert {0.1, 0.2, 0.3} <= set(leaves)

@@ -27,7 +27,7 @@ def test_untrained_policies_score_what_those_of_the_thesis_did(name, fields, sco
         params_key, obs_key, eval_key = jax.random.split(key, 3)
         params = network.init(params_key, task.observe(task.reset(obs_key)))
         policy = partial(network.apply, params, method="policy")
-        return rollout.evaluate(eval_key, task, policy, num_worlds=8)["return"]
+        return rollout.evaluate(eval_key, task, policy, num_envs=8)["return"]
 
     returns = jax.lax.map(mean_return, jax.random.split(jax.random.key(0), num_policies))
     standard_error = returns.std() / num_policies**0.5

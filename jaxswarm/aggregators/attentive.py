@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
-from jaxswarm import sets
-from jaxswarm.sets import DenseView
-from jaxswarm.types import is_flag, is_whole, require
+from jaxswarm.aggregators import sets
+from jaxswarm.aggregators.sets import DenseView
+from jaxswarm.types import is_bool, is_integer, require
 
 
 class Attentive(nn.Module):
@@ -19,7 +19,7 @@ class Attentive(nn.Module):
         p_hij = softmax_j (q_hi . k_hj / sqrt(d)),   y_i = x_i + W_o [sum_j p_hij v_hj]_h + b_o,   z = sum_i w_i y_i
 
     With `pooling="mean"` all w_i are equal, as in the thesis; with "query", w = softmax_i (q_0 . y_i / sqrt(D)), where
-    q_0 is a linear function of what the receiver knows of itself. Parameters and their initialisation are those of
+    q_0 is a linear function of what the receiver knows of itself. Parameters and their initialization are those of
     PyTorch's `MultiheadAttention`, but the output projection's is orthogonal with gain sqrt(2). The vector of an empty
     group is 0.
     """
@@ -34,9 +34,9 @@ class Attentive(nn.Module):
     num_encoders: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_whole(1), "num_heads")
+        require(self, "whole numbers from 1", is_integer(1), "num_heads")
         require(self, "mean, query", lambda x: x in ("mean", "query"), "pooling")
-        require(self, "True, False", is_flag, "residual")
+        require(self, "True, False", is_bool, "residual")
         super().__post_init__()
 
     def check_width(self, width: int) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Int, Shaped
 
-from jaxswarm import sets
+from jaxswarm.aggregators import sets
 from jaxswarm.aggregators.monoids import Mean
-from jaxswarm.sets import DenseView
-from jaxswarm.types import is_whole, require
+from jaxswarm.aggregators.sets import DenseView
+from jaxswarm.types import is_integer, require
 
 
 class Concat(nn.Module):
@@ -29,7 +29,7 @@ class Concat(nn.Module):
     num_encoders: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_whole(1), "max_entities")
+        require(self, "whole numbers from 1", is_integer(1), "max_entities")
         super().__post_init__()
 
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
@@ -67,8 +67,8 @@ class Histogram(nn.Module):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_whole(1), "num_distances")
-        require(self, "whole numbers from 3", is_whole(3), "num_bearings")
+        require(self, "whole numbers from 1", is_integer(1), "num_distances")
+        require(self, "whole numbers from 3", is_integer(3), "num_bearings")
         require(self, "positive numbers", lambda x: x > 0, "max_distance")
         super().__post_init__()
 
@@ -111,7 +111,7 @@ class RadialBasis(nn.Module):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 2", is_whole(2), "num_distances", "num_bearings")
+        require(self, "whole numbers from 2", is_integer(2), "num_distances", "num_bearings")
         require(self, "positive numbers", lambda x: x > 0, "max_distance", "distance_width", "bearing_width")
         super().__post_init__()
 
@@ -121,8 +121,8 @@ class RadialBasis(nn.Module):
         """Values of all basis functions, and count."""
         d, b = _distance_and_bearing(features)
         spacing = self.max_distance / (self.num_distances - 1)
-        centres = jnp.linspace(0.0, self.max_distance, self.num_distances)
-        near = jnp.exp(-0.5 * jnp.square((d - centres[None]) / (self.distance_width * spacing)))
+        centers = jnp.linspace(0.0, self.max_distance, self.num_distances)
+        near = jnp.exp(-0.5 * jnp.square((d - centers[None]) / (self.distance_width * spacing)))
         v = self.bearing_width * 2 * math.pi / self.num_bearings
         ahead = jnp.exp((b @ jnp.asarray(_directions(self.num_bearings)) - 1.0) / v**2)
         return _outer(near, ahead, jnp.multiply), jnp.ones((features.shape[0], 1))

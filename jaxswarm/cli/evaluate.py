@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import load_policies, require_fit, which_checkpoint, which_seeds
-from jaxswarm.cli.words import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
+from jaxswarm.cli.policy_options import load_policies, require_fit, which_checkpoint, which_seeds
+from jaxswarm.cli.program import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
 from jaxswarm.config import Config, ConfigError
 
 HELP = """\
@@ -34,14 +34,14 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    paths, options, words = split_paths(arguments, OPTIONS)
+    paths, options, overrides = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-eval PATH [key=value ...]")
     which = which_checkpoint(options)
     config = load(paths[0])
-    episodes = whole("episodes", options.get("episodes", config["eval_worlds"]), 1)
+    episodes = whole("episodes", options.get("episodes", config["num_eval_envs"]), 1)
     seed = whole("seed", options.get("seed", 0), 0)
-    changes = configs.combinations(words)
+    changes = configs.combinations(overrides)
     only_of_task(changes[0], config, OPTIONS)
     asked = {"which": which, "seed": seed, "episodes": episodes, "train_seeds": which_seeds(options, config)}
     result = _evaluate(paths[0], config, changes, asked)
@@ -97,7 +97,7 @@ def _mean(values: Any) -> float | None:
 
 
 def _report(run_dir: Path, result: dict[str, Any]) -> int:
-    from jaxswarm.checkpoint import replace_text  # noqa: PLC0415
+    from jaxswarm.files import replace_text  # noqa: PLC0415
 
     name = f"eval-{result['which']}-{time.strftime('%Y%m%d-%H%M%S')}"
     while (path := run_dir / f"{name}.json").exists():

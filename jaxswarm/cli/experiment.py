@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.checkpoint import replace_text
-from jaxswarm.cli.words import command, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.program import command, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
+from jaxswarm.files import replace_text
 
 HELP = """\
 jaxswarm-experiment FIGURE [seeds=N] [scale=1.0] [series=PATTERN] [dir=runs/figures] [out=PATH] [key=value ...]
@@ -43,41 +43,44 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP + "\n" + _figures_help())
         return 0 if arguments else 2
-    name, (options, words) = arguments[0], split(arguments[1:], OPTIONS)
+    name, (options, overrides) = arguments[0], split(arguments[1:], OPTIONS)
     if name == "all" and {"seeds", "scale", "series"} & options.keys():
         raise ConfigError("seeds, scale and series have no meaning here; all reports what has been trained")
     directory = Path(options.get("dir", "runs/figures"))
     out = Path(options.get("out", "benchmarks/results" if name == "all" else directory))
     try:
         if name == "all":
-            return _report_all(directory, out, words)
-        return _run(arguments, directory, out, options, words)
+            return _report_all(directory, out, overrides)
+        return _run(arguments, directory, out, options, overrides)
     except BrokenPipeError:
         raise
     except OSError as error:
         raise ConfigError(f"cannot write to {error.filename}: {error.strerror}") from error
 
 
-def _run(arguments: Sequence[str], directory: Path, out: Path, options: dict[str, str], words: Sequence[str]) -> int:
-    from jaxswarm import experiments  # noqa: PLC0415
+def _run(
+    arguments: Sequence[str], directory: Path, out: Path, options: dict[str, str], overrides: Sequence[str]
+) -> int:
+    from jaxswarm.figures import figure as experiments  # noqa: PLC0415
 
     figure = experiments.load(arguments[0])
-    if any(word.startswith("num_seeds=") for word in words):
+    if any(word.startswith("num_seeds=") for word in overrides):
         raise ConfigError("num_seeds has no meaning here; write seeds=N")
     num_seeds = whole("seeds", options["seeds"], 1) if "seeds" in options else None
     scale, chosen = _scale(options.get("scale", "1")), _choose(list(figure.series), options.get("series", "*"))
-    trials = experiments.plan(figure, directory, experiments.stored(directory), num_seeds, scale, words)
+    trials = experiments.plan(figure, directory, experiments.stored(directory), num_seeds, scale, overrides)
     if not _train({series: trials[series] for series in chosen}):
         print(f"stopped; continue with: {command('jaxswarm-experiment', *arguments)}")
         return 0
-    section = _section(figure, trials, experiments.stored(directory), out, words)
+    section = _section(figure, trials, experiments.stored(directory), out, overrides)
     replace_text(out / f"{figure.name}.md", section)
     print(f"\n{section}\nwrote {out / f'{figure.name}.md'}")
     return 0
 
 
-def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
-    from jaxswarm import experiments, report  # noqa: PLC0415
+def _report_all(directory: Path, out: Path, overrides: Sequence[str]) -> int:
+    from jaxswarm.figures import figure as experiments  # noqa: PLC0415
+    from jaxswarm.figures import report  # noqa: PLC0415
 
     kept = out / "runs"
     found, sections, used = experiments.stored(directory, kept), [], set()
@@ -86,8 +89,8 @@ def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
             f"dir = {directory} holds no run folder; train a figure first, or name the folder of its runs"
         )
     for figure in map(experiments.load, experiments.names()):
-        trials = experiments.plan(figure, directory, found, words=words)
-        sections.append(_section(figure, trials, found, out, words))
+        trials = experiments.plan(figure, directory, found, overrides=overrides)
+        sections.append(_section(figure, trials, found, out, overrides))
         configs_of_series = [trial.config for trial, *_ in trials.values()]
         used |= {folder.path for folder in found if any(experiments.is_of(folder, x) for x in configs_of_series)}
     for folder in found:
@@ -101,21 +104,23 @@ def _report_all(directory: Path, out: Path, words: Sequence[str]) -> int:
     return 0
 
 
-def _section(figure: Any, trials: dict, found: Sequence[Any], out: Path, words: Sequence[str]) -> str:
+def _section(figure: Any, trials: dict, found: Sequence[Any], out: Path, overrides: Sequence[str]) -> str:
     """The figure's part of the report, its pictures drawn."""
-    from jaxswarm import experiments, report  # noqa: PLC0415
+    from jaxswarm.figures import figure as experiments  # noqa: PLC0415
+    from jaxswarm.figures import report  # noqa: PLC0415
 
     out.mkdir(parents=True, exist_ok=True)
     measured = experiments.measure(figure, trials, found, lambda text: print(f"warning: {text}", file=sys.stderr))
     if measured:
         experiments.draw(figure, measured, out)
-    return report.section(figure, trials, measured, words)
+    return report.section(figure, trials, measured, overrides)
 
 
 def _train(trials: dict) -> bool:
     """Trains series after series, from where their folders stand; whether all have reached their end."""
-    from jaxswarm import ensemble, experiments  # noqa: PLC0415
-    from jaxswarm.trials import train  # noqa: PLC0415
+    from jaxswarm.figures import figure as experiments  # noqa: PLC0415
+    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.studies.trials import train  # noqa: PLC0415
 
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[trial.settings.num_seeds for of_series in trials.values() for trial in of_series]))
@@ -150,7 +155,7 @@ def _scale(text: str) -> float:
 
 def _figures_help() -> str:
     """Figures with the comment of each file."""
-    from jaxswarm import experiments  # noqa: PLC0415
+    from jaxswarm.figures import figure as experiments  # noqa: PLC0415
 
     lines = ["figures"]
     for name in experiments.names():

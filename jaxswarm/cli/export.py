@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import policy_on_task
-from jaxswarm.cli.words import load, only_of_task, program, split_paths, use_compile_cache, wants_help
+from jaxswarm.cli.policy_options import policy_on_task
+from jaxswarm.cli.program import load, only_of_task, program, split_paths, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -19,7 +19,7 @@ policy of the first, or of train_seed.
 
 examples
   jaxswarm-export runs/thesis
-  jaxswarm-export runs/thesis task.num_agents=100 out=policy.jax     # up to 99 neighbours
+  jaxswarm-export runs/thesis task.num_agents=100 out=policy.jax     # up to 99 neighbors
 """
 USE = """\
 with jax and flatbuffers:
@@ -37,10 +37,10 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    paths, options, words = split_paths(arguments, OPTIONS)
+    paths, options, overrides = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
         raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-export PATH [key=value ...]")
-    pairs = configs.parse(words)
+    pairs = configs.parse(overrides)
     only_of_task(pairs, load(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "policy.jax"))
     use_compile_cache()
@@ -49,12 +49,12 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     import jax  # noqa: PLC0415
 
-    from jaxswarm import checkpoint, export  # noqa: PLC0415
+    from jaxswarm import export, files  # noqa: PLC0415
 
     task, network, params, update = found
     exported = export.export_policy(task, network, params)
     out.parent.mkdir(parents=True, exist_ok=True)
-    checkpoint.replace_bytes(out, bytes(exported.serialize()))
+    files.replace_bytes(out, bytes(exported.serialize()))
     print(f"wrote {out} ({out.stat().st_size / 1e6:.2f} MB), the policy after update {update}")
     own, groups = jax.tree.unflatten(exported.in_tree, map(str, exported.in_avals))[0]
     print(USE.format(path=out, own=own, groups=str(groups).replace("'", "")))

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxswarm import curves, plots, runs
-from jaxswarm.checkpoint import replace_text
-from jaxswarm.cli.words import program, split, wants_help, whole
+from jaxswarm.analysis import curves, plots
+from jaxswarm.analysis import run_folders as runs
+from jaxswarm.analysis.curves import STATISTICS, Curve
+from jaxswarm.analysis.plots import Picture, Series
+from jaxswarm.analysis.run_folders import RunFolder
+from jaxswarm.cli.program import program, split, wants_help, whole
 from jaxswarm.config import ConfigError
-from jaxswarm.curves import STATISTICS, Curve
-from jaxswarm.plots import Picture, Series
-from jaxswarm.runs import RunFolder
+from jaxswarm.files import replace_text
 
 HELP = """\
 jaxswarm-plot PATH... [out=FILE.png] [key=value ...]
@@ -112,15 +113,15 @@ def main(arguments: Sequence[str]) -> int:
 def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
     """Options, and paths; what exists is a path, whatever is in its name."""
     names = [field.name for field in dataclasses.fields(Options)]
-    options, words = split(arguments, names)
-    for word in words:
+    options, overrides = split(arguments, names)
+    for word in overrides:
         name, equals, _ = word.partition("=")
         if equals and not Path(word).exists():
             near = "".join(f"did you mean {x!r}? " for x in difflib.get_close_matches(name, names, n=1))
             raise ConfigError(f"unknown key {name!r}; {near}accepted: {', '.join(names)}")
-    if not words:
+    if not overrides:
         raise ConfigError("give a run folder, or a folder that holds some: jaxswarm-plot PATH... [key=value ...]")
-    return Options(**options), [Path(word) for word in words]
+    return Options(**options), [Path(word) for word in overrides]
 
 
 def _output(out: str) -> Path:

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import policy_on_task
-from jaxswarm.cli.words import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
+from jaxswarm.cli.policy_options import policy_on_task
+from jaxswarm.cli.program import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -33,12 +33,12 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    paths, options, words = split_paths(arguments, OPTIONS)
+    paths, options, overrides = split_paths(arguments, OPTIONS)
     if not paths:
         raise ConfigError("give at least one run folder: jaxswarm-render PATH [key=value ...]")
     seed = whole("seed", options.get("seed", 0), 0)
     sizes = {name: whole(name, options[name], 1) for name in ("frames", "until") if name in options}
-    pairs = configs.parse(words)
+    pairs = configs.parse(overrides)
     only_of_task(pairs, load(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "replay.html"))
     use_compile_cache()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
-from jaxswarm.cli.words import command, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.program import command, program, split, use_compile_cache, wants_help, whole
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -20,7 +20,7 @@ The first form trains every combination of the values, each in a run folder of i
 side in one program, the rest one program after another. Ends with a table, summary.csv and curves.png.
 
 The second form searches with Optuna: configs/search/NAME.yaml, or a file, says what may be chosen. Trials are trained
-over num_seeds seeds; the mean return during training is maximised. Machines that name the same storage (a journal file
+over num_seeds seeds; the mean return during training is maximized. Machines that name the same storage (a journal file
 that they share, or a database such as postgresql://user@host/name) work on the same search, each in its own sweep_dir.
 
 Ctrl-C or SIGTERM ends after a checkpoint; resume=PATH goes on from there.
@@ -40,30 +40,31 @@ def main(arguments: Sequence[str]) -> int:
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
-    options, words = split(arguments, OPTIONS)
+    options, overrides = split(arguments, OPTIONS)
     if "resume" in options:
-        if words or len(options) > 1:
+        if overrides or len(options) > 1:
             raise ConfigError("resume=PATH takes nothing else")
         sweep_dir = Path(options["resume"])
-        options, words = _load(sweep_dir)
+        options, overrides = _load(sweep_dir)
     else:
         sweep_dir = Path(options.pop("sweep_dir", "") or f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}")
         if sweep_dir.exists() and (not sweep_dir.is_dir() or any(sweep_dir.iterdir())):
             raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; continue it with resume={sweep_dir}")
     if "search" in options:
-        return _search(sweep_dir, options, words)
+        return _search(sweep_dir, options, overrides)
     if options:
         raise ConfigError(f"{next(iter(options))} has no meaning without search=NAME")
-    return _sweep(sweep_dir, words)
+    return _sweep(sweep_dir, overrides)
 
 
-def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
-    from jaxswarm import ensemble, sweep  # noqa: PLC0415
-    from jaxswarm.trials import train  # noqa: PLC0415
+def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
+    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.studies import grid as sweep  # noqa: PLC0415
+    from jaxswarm.studies.trials import train  # noqa: PLC0415
 
-    trials = sweep.trials(sweep.expand(words), sweep_dir)
+    trials = sweep.trials(sweep.expand(overrides), sweep_dir)
     programs = sweep.programs(trials)
-    _save(sweep_dir, {}, words)
+    _save(sweep_dir, {}, overrides)
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
     print(f"{_count(trials, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
@@ -86,20 +87,21 @@ def _sweep(sweep_dir: Path, words: Sequence[str]) -> int:
     return plot.main([str(sweep_dir), f"out={sweep_dir / 'curves.png'}"])
 
 
-def _search(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> int:
-    from jaxswarm import ensemble, search  # noqa: PLC0415
-    from jaxswarm.trials import Trial, train  # noqa: PLC0415
+def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
+    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.studies import search  # noqa: PLC0415
+    from jaxswarm.studies.trials import Trial, train  # noqa: PLC0415
 
-    pairs = configs.parse(words)
+    pairs = configs.parse(overrides)
     config = configs.compose_pairs(pairs)
     space = search.load_space(options["search"], config)
     num_trials = whole("trials", options.get("trials", 20), 1)
-    _save(sweep_dir, options, words)
+    _save(sweep_dir, options, overrides)
     use_compile_cache()
     ensemble.use_cores(config["num_seeds"])
     study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")))
     search.requeue_killed(study, sweep_dir)
-    while search.num_begun(study) < num_trials:
+    while search.num_started(study) < num_trials:
         asked = search.ask(study, config["seed"])
         run_dir = Path(asked.user_attrs.get(search.RUN_DIR, sweep_dir.resolve() / f"trial-{asked.number:04}"))
         asked.set_user_attr(search.RUN_DIR, str(run_dir))
@@ -122,12 +124,12 @@ def _count(things: Sequence, name: str) -> str:
     return f"{len(things)} {name}" + ("s" if len(things) != 1 else "")
 
 
-def _save(sweep_dir: Path, options: dict[str, str], words: Sequence[str]) -> None:
-    from jaxswarm.checkpoint import replace_text  # noqa: PLC0415
+def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> None:
+    from jaxswarm.files import replace_text  # noqa: PLC0415
 
     try:
         sweep_dir.mkdir(parents=True, exist_ok=True)
-        replace_text(sweep_dir / PLAN, json.dumps({"options": options, "words": list(words)}, indent=2) + "\n")
+        replace_text(sweep_dir / PLAN, json.dumps({"options": options, "words": list(overrides)}, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"cannot write to {sweep_dir}: {error.strerror}") from error
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policies import load_policies
-from jaxswarm.cli.words import (
+from jaxswarm.cli.policy_options import load_policies
+from jaxswarm.cli.program import (
     command,
     join_processes,
     load,
@@ -56,12 +56,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _train(arguments: Sequence[str], is_first: bool) -> int:
-    paths, words = split(arguments, ("run_dir", "resume"))
+    paths, overrides = split(arguments, ("run_dir", "resume"))
     if "resume" in paths:
         if "run_dir" in paths:
             raise ConfigError("give one of run_dir and resume")
-        return _resume(Path(paths["resume"]), words, is_first)
-    config = configs.compose(words)
+        return _resume(Path(paths["resume"]), overrides, is_first)
+    config = configs.compose(overrides)
     run_dir = Path(paths.get("run_dir") or _default_run_dir(config))
     if is_first and run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
         hint = f"continue it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
@@ -69,9 +69,9 @@ def _train(arguments: Sequence[str], is_first: bool) -> int:
     return _fit(config, run_dir, is_resumed=False, is_first=is_first)
 
 
-def _resume(run_dir: Path, words: Sequence[str], is_first: bool) -> int:
+def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
     config = load(run_dir)
-    pairs = configs.parse(words)
+    pairs = configs.parse(overrides)
     only(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
     extended = configs.override(config, pairs)
     if pairs:
@@ -86,12 +86,14 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     run, experiment = configs.run_settings(config), configs.build(config)
     num_updates = run.length(experiment.agent_steps_per_update)
     use_compile_cache()
-    from jaxswarm import ensemble, policies, render  # noqa: PLC0415
-    from jaxswarm.checkpoint import CheckpointError  # noqa: PLC0415
-    from jaxswarm.fit import DivergedError, fit  # noqa: PLC0415
+    from jaxswarm import render  # noqa: PLC0415
+    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.host import trained as policies  # noqa: PLC0415
+    from jaxswarm.host.checkpoint import CheckpointError  # noqa: PLC0415
+    from jaxswarm.host.fit import DivergedError, fit  # noqa: PLC0415
 
     ensemble.use_cores(run.num_seeds)
-    params = policies.to_begin_with(run, run_dir)
+    params = policies.warm_start(run, run_dir)
     print(_summary(config, experiment, num_updates, run_dir), flush=True)
     try:
         train_state, rows = fit(
@@ -135,10 +137,10 @@ def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
     return f"{median:.2f}" if len(returns) == 1 else f"{median:.2f} [{low:.2f}, {high:.2f}] over {len(returns)} seeds"
 
 
-def _keys_help(words: Sequence[str]) -> str:
+def _keys_help(overrides: Sequence[str]) -> str:
     """Groups with the first comment of each file, and keys as the files document them, those of the chosen groups."""
-    config = configs.compose(words)  # an error for what does not exist
-    lines, chosen = ["groups (* default)"], dict(configs.parse(words))
+    config = configs.compose(overrides)  # an error for what does not exist
+    lines, chosen = ["groups (* default)"], dict(configs.parse(overrides))
     main = (configs.config_dir() / "train.yaml").read_text()
     for group, names in configs.choices().items():
         for name in names:

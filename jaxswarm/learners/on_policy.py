@@ -16,7 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm.rollout import Trajectory, spread_rows
-from jaxswarm.types import Key, Metrics, Observation, is_flag, is_whole, pytree, require, static
+from jaxswarm.types import Key, Metrics, Observation, is_bool, is_integer, pytree, require, static
 
 Params = Any
 Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
@@ -40,24 +40,24 @@ class OnPolicy:
     gae_lambda: float = 0.95
     value_coefficient: float = 0.5
     entropy_coefficient: float = 0.0
-    max_gradient_norm: float = 0.5
+    max_grad_norm: float = 0.5
     adam_epsilon: float = 1e-5
     num_epochs: int = static(default=2)
     batch_size: int | None = static(default=None)
-    minibatch: Literal["agents", "worlds"] = static(default="worlds")
+    sampling_unit: Literal["agents", "envs"] = static(default="envs")
     bootstrap_truncation: bool = static(default=True)
 
 
 def check(learner: OnPolicy) -> None:
     """A `ValueError` names the first of these hyper-parameters that is not possible."""
-    positive = ("learning_rate", "max_gradient_norm", "adam_epsilon")
+    positive = ("learning_rate", "max_grad_norm", "adam_epsilon")
     require(learner, "positive finite numbers", lambda x: 0 < x < math.inf, *positive)
     require(learner, "numbers from 0 to 1", lambda x: 0 <= x <= 1, "discount", "gae_lambda")
     require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
-    require(learner, "whole numbers from 1", is_whole(1), "num_epochs")
-    require(learner, "null, whole numbers from 2", lambda x: x is None or is_whole(2)(x), "batch_size")
-    require(learner, "True, False", is_flag, "bootstrap_truncation")
-    require(learner, "agents, worlds", lambda x: x in ("agents", "worlds"), "minibatch")
+    require(learner, "whole numbers from 1", is_integer(1), "num_epochs")
+    require(learner, "null, whole numbers from 2", lambda x: x is None or is_integer(2)(x), "batch_size")
+    require(learner, "True, False", is_bool, "bootstrap_truncation")
+    require(learner, "agents, envs", lambda x: x in ("agents", "envs"), "sampling_unit")
 
 
 def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
@@ -68,7 +68,7 @@ def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
         return nearest[0]
     unit = _unit(learner, num_agents)
     raise ValueError(
-        f"batch_size = {asked} is not possible; accepted: divisors of num_worlds * num_steps * num_agents = "
+        f"batch_size = {asked} is not possible; accepted: divisors of num_envs * num_steps * num_agents = "
         f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest[:4]))) or 'none'}"
     )
 
@@ -84,12 +84,12 @@ def nearest_batch_sizes(learner: OnPolicy, num_samples: int, num_agents: int) ->
 
 def _unit(learner: OnPolicy, num_agents: int) -> int:
     """Samples that a minibatch has or has not as a whole."""
-    return 1 if learner.minibatch == "agents" else num_agents
+    return 1 if learner.sampling_unit == "agents" else num_agents
 
 
 @pytree
 class LearnerState:
-    """Parameters of the network and of the optimiser."""
+    """Parameters of the network and of the optimizer."""
 
     params: Params
     optimizer_state: optax.OptState
@@ -99,7 +99,7 @@ State = TypeVar("State", bound=LearnerState)
 
 
 @pytree
-class Batch:
+class Minibatch:
     """Samples to learn from, one row each."""
 
     obs: Observation
@@ -124,13 +124,13 @@ class Samples:
     action_std: Float[Array, "samples action_dim"]
 
 
-Loss = Callable[[Params, Batch], tuple[Array, Metrics]]
+Loss = Callable[[Params, Minibatch], tuple[Array, Metrics]]
 
 
 def adam(learner: OnPolicy) -> optax.GradientTransformation:
     """Adam, on shortened gradients."""
     return optax.chain(
-        optax.clip_by_global_norm(learner.max_gradient_norm),
+        optax.clip_by_global_norm(learner.max_grad_norm),
         optax.adam(learner.learning_rate, eps=learner.adam_epsilon),
     )
 
@@ -158,10 +158,10 @@ def update(
     state, metrics = descend(
         key,
         loss,
-        partial(FETCH[learner.minibatch], task, samples),
+        partial(FETCH[learner.sampling_unit], task, samples),
         adam(learner),
         state,
-        num_samples if learner.minibatch == "agents" else num_samples // task.num_agents,
+        num_samples if learner.sampling_unit == "agents" else num_samples // task.num_agents,
         num_samples // batch_size(learner, num_samples, task.num_agents),
         learner.num_epochs,
     )
@@ -170,7 +170,7 @@ def update(
 
 def trajectory_values(
     network: Any, params: Params, task: Any, trajectory: Trajectory
-) -> tuple[Float[Array, "steps worlds agents"], Float[Array, "steps worlds agents"]]:
+) -> tuple[Float[Array, "steps envs agents"], Float[Array, "steps envs agents"]]:
     """Values of the state before each step, and of the state after it, before any reset."""
 
     def value(state: Any) -> Array:
@@ -187,7 +187,7 @@ def trajectory_values(
     return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0)))
 
 
-def gone_after(task: Any, trajectory: Trajectory) -> Bool[Array, "steps worlds #agents"]:
+def gone_after(task: Any, trajectory: Trajectory) -> Bool[Array, "steps envs #agents"]:
     """Agents that do not exist after each step, before any reset."""
     if trajectory.mask is None:
         return jnp.zeros((*trajectory.reward.shape, 1), bool)
@@ -195,16 +195,16 @@ def gone_after(task: Any, trajectory: Trajectory) -> Bool[Array, "steps worlds #
 
 
 def generalized_advantages(
-    reward: Float[Array, "steps worlds"],
-    is_terminal: Bool[Array, "steps worlds"],
-    is_done: Bool[Array, "steps worlds"],
-    value: Float[Array, "steps worlds agents"],
-    next_value: Float[Array, "steps worlds agents"],
+    reward: Float[Array, "steps envs"],
+    is_terminal: Bool[Array, "steps envs"],
+    is_done: Bool[Array, "steps envs"],
+    value: Float[Array, "steps envs agents"],
+    next_value: Float[Array, "steps envs agents"],
     discount: Float[Array, ""] | float,
     gae_lambda: Float[Array, ""] | float,
-    is_gone: Bool[Array, "steps worlds #agents"] | bool = False,
-) -> Float[Array, "steps worlds agents"]:
-    """Generalised advantage estimates (Schulman et al., 2016).
+    is_gone: Bool[Array, "steps envs #agents"] | bool = False,
+) -> Float[Array, "steps envs agents"]:
+    """Generalized advantage estimates (Schulman et al., 2016).
 
     `is_terminal` steps have no value after them; `is_done` steps end an episode, so nothing flows back across them.
     For agents that do not exist after a step, `is_gone`, it is both.
@@ -223,8 +223,8 @@ def generalized_advantages(
 def stored_samples(
     task: Any,
     trajectory: Trajectory,
-    advantage: Float[Array, "steps worlds agents"],
-    target: Float[Array, "steps worlds agents"],
+    advantage: Float[Array, "steps envs agents"],
+    target: Float[Array, "steps envs agents"],
 ) -> Samples:
     """All samples of a trajectory."""
     views = jax.vmap(jax.vmap(task.view))(trajectory.state)
@@ -233,27 +233,27 @@ def stored_samples(
     return Samples(jax.tree.map(_merge, views), *[_merge(_merge(x)) for x in arrays])
 
 
-def fetch_agents(task: Any, samples: Samples, sample: Int[Array, " rows"]) -> Batch:
+def fetch_agents(task: Any, samples: Samples, sample: Int[Array, " rows"]) -> Minibatch:
     """The samples of these numbers."""
     view = jax.tree.map(lambda x: x[sample // task.num_agents], samples.view)
-    return _batch(samples, sample, jax.vmap(task.perceive)(view, sample % task.num_agents))
+    return _minibatch(samples, sample, jax.vmap(task.perceive)(view, sample % task.num_agents))
 
 
-def fetch_worlds(task: Any, samples: Samples, world: Int[Array, " worlds"]) -> Batch:
+def fetch_envs(task: Any, samples: Samples, env: Int[Array, " envs"]) -> Minibatch:
     """The samples of all agents of the worlds of these numbers."""
     agent = jnp.arange(task.num_agents)
-    view = jax.tree.map(lambda x: x[world], samples.view)
+    view = jax.tree.map(lambda x: x[env], samples.view)
     obs = jax.vmap(jax.vmap(task.perceive, (None, 0)), (0, None))(view, agent)
-    return _batch(samples, _merge(world[:, None] * task.num_agents + agent[None]), jax.tree.map(_merge, obs))
+    return _minibatch(samples, _merge(env[:, None] * task.num_agents + agent[None]), jax.tree.map(_merge, obs))
 
 
-FETCH = {"agents": fetch_agents, "worlds": fetch_worlds}
+FETCH = {"agents": fetch_agents, "envs": fetch_envs}
 
 
-def _batch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) -> Batch:
+def _minibatch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) -> Minibatch:
     policy = (samples.action_mean, samples.action_std)
     arrays = (samples.action, samples.log_prob, samples.advantage, samples.target, *policy)
-    return Batch(obs, *[x[sample] for x in arrays])
+    return Minibatch(obs, *[x[sample] for x in arrays])
 
 
 def _merge(x: Array) -> Array:
@@ -281,7 +281,7 @@ def shuffled(key: Key, num_rows: int, num_columns: int) -> Int[Array, "rows colu
 def descend(
     key: Key,
     loss: Loss,
-    fetch: Callable[[Int[Array, " units"]], Batch],
+    fetch: Callable[[Int[Array, " units"]], Minibatch],
     optimizer: optax.GradientTransformation,
     state: State,
     num_units: int,
@@ -324,12 +324,12 @@ def maximum(x: Float[Array, "#rows"], mask: Mask) -> Float[Array, ""]:
     return x.max() if mask is None else jnp.where(mask, x, 0.0).max()
 
 
-def standardised(advantage: Float[Array, " rows"], mask: Mask) -> Float[Array, " rows"]:
+def standardized(advantage: Float[Array, " rows"], mask: Mask) -> Float[Array, " rows"]:
     """Advantages of a minibatch with mean 0 and sample standard deviation 1."""
     num_rows = advantage.size if mask is None else mask.sum()
-    centred = advantage - mean(advantage, mask)
-    variance = mean(jnp.square(centred), mask) * (num_rows / jnp.maximum(num_rows - 1, 1))
-    return centred / (jnp.sqrt(variance) + 1e-8)
+    centered = advantage - mean(advantage, mask)
+    variance = mean(jnp.square(centered), mask) * (num_rows / jnp.maximum(num_rows - 1, 1))
+    return centered / (jnp.sqrt(variance) + 1e-8)
 
 
 def squared_error(value: Float[Array, " rows"], target: Float[Array, " rows"], mask: Mask) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation with clipping (Schulman et al., 2017)."""
+"""Proximal policy optimization with clipping (Schulman et al., 2017)."""
 
 from functools import partial
 from typing import Any
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxswarm.learners import on_policy
-from jaxswarm.learners.on_policy import Batch, LearnerState, OnPolicy, Params
+from jaxswarm.learners.on_policy import LearnerState, Minibatch, OnPolicy, Params
 from jaxswarm.rollout import Trajectory
 from jaxswarm.types import Key, Metrics, pytree, require
 
@@ -32,18 +32,18 @@ class PPO(OnPolicy):
     ) -> tuple[LearnerState, Metrics]:
         """Learns from one trajectory, all epochs."""
 
-        def loss(params: Params, batch: Batch) -> tuple[Array, Metrics]:
+        def loss(params: Params, batch: Minibatch) -> tuple[Array, Metrics]:
             return self.loss(network, params, batch)
 
         return on_policy.update(self, loss, key, state, network, task, trajectory)
 
-    def loss(self, network: Any, params: Params, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
-        """Clipped surrogate, squared value error and entropy bonus of a minibatch; advantages are normalised in it."""
+    def loss(self, network: Any, params: Params, batch: Minibatch) -> tuple[Float[Array, ""], Metrics]:
+        """Clipped surrogate, squared value error and entropy bonus of a minibatch; advantages are normalized in it."""
         policy, value = network.apply(params, batch.obs)
         mean = partial(on_policy.mean, mask=batch.obs.mask)
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
-        advantage = on_policy.standardised(batch.advantage, batch.obs.mask)
+        advantage = on_policy.standardized(batch.advantage, batch.obs.mask)
         clipped = jnp.clip(ratio, 1.0 - self.clip_range, 1.0 + self.clip_range)
         policy_loss = -mean(jnp.minimum(ratio * advantage, clipped * advantage))
         value_loss = on_policy.squared_error(value, batch.target, batch.obs.mask)

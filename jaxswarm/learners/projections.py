@@ -82,14 +82,14 @@ def euclidean(
 
 
 def wasserstein(std: Float[Array, "*batch dim"], old_std: Float[Array, "*batch dim"]) -> Float[Array, "*batch"]:
-    """Squared 2-Wasserstein distance of centred Gaussians, in units of the old standard deviations."""
+    """Squared 2-Wasserstein distance of centered Gaussians, in units of the old standard deviations."""
     return jnp.square((std - old_std) / old_std).sum(-1)
 
 
 def wasserstein_unscaled(
     std: Float[Array, "*batch dim"], old_std: Float[Array, "*batch dim"]
 ) -> Float[Array, "*batch"]:
-    """Squared 2-Wasserstein distance of centred Gaussians."""
+    """Squared 2-Wasserstein distance of centered Gaussians."""
     return jnp.square(std - old_std).sum(-1)
 
 
@@ -139,7 +139,7 @@ def _between(
 
 
 def kl(std: Float[Array, "*batch dim"], old_std: Float[Array, "*batch dim"]) -> Float[Array, "*batch"]:
-    """Kullback-Leibler divergence of centred Gaussians: half the sum of x - 1 - ln x, with x = (std / old_std)^2."""
+    """Kullback-Leibler divergence of centered Gaussians: half the sum of x - 1 - ln x, with x = (std / old_std)^2."""
     t = (old_std - std) * (old_std + std) / jnp.square(old_std)
     return 0.5 * _divergence(t, 2.0 * jnp.log(old_std / std)).sum(-1)
 
@@ -148,7 +148,7 @@ def kl(std: Float[Array, "*batch dim"], old_std: Float[Array, "*batch dim"]) -> 
 def project_std_kl(
     std: Float[Array, "*batch dim"], old_std: Float[Array, "*batch dim"], bound: Bound
 ) -> Float[Array, "*batch dim"]:
-    """The centred Gaussian of least divergence to the new one whose divergence to the old one is within the bound.
+    """The centered Gaussian of least divergence to the new one whose divergence to the old one is within the bound.
 
     Where it is outside, precisions are averaged: 1 / projected^2 = s / std^2 + (1 - s) / old_std^2, with s in (0, 1)
     such that the divergence is the bound. For bounds up to 30, s is exact to nine digits or to rounding.

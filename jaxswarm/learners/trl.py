@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxswarm.distributions import gaussian_with_std
 from jaxswarm.learners import on_policy
-from jaxswarm.learners.on_policy import Batch, LearnerState, Mask, OnPolicy, Params
+from jaxswarm.learners.on_policy import LearnerState, Mask, Minibatch, OnPolicy, Params
 from jaxswarm.learners.projections import ENTROPY_SCHEDULES, PROJECTIONS, Projection, control_entropy, entropy
 from jaxswarm.networks import map_log_std
 from jaxswarm.rollout import Trajectory
@@ -47,7 +47,7 @@ class TRL(OnPolicy):
     objective: Literal["projected", "raw"] = static(default="projected")
     mean_bound: float = 0.03
     cov_bound: float = 0.001
-    coefficient: float = 8.0
+    regression_coefficient: float = 8.0
     entropy_control: Literal["none", "inequality", "equality"] = static(default="none")
     entropy_schedule: Literal["linear", "exponential"] = static(default="linear")
     target_entropy: float = 0.0
@@ -56,7 +56,15 @@ class TRL(OnPolicy):
 
     def __post_init__(self) -> None:
         on_policy.check(self)
-        require(self, "positive numbers", lambda x: x > 0, "mean_bound", "cov_bound", "coefficient", "entropy_updates")
+        require(
+            self,
+            "positive numbers",
+            lambda x: x > 0,
+            "mean_bound",
+            "cov_bound",
+            "regression_coefficient",
+            "entropy_updates",
+        )
         require(self, "numbers between 0 and 1", lambda x: 0 < x < 1, "entropy_temperature")
         for name, accepted in {
             "projection": tuple(PROJECTIONS),
@@ -92,7 +100,7 @@ class TRL(OnPolicy):
         )
         least_entropy = self.scheduled_entropy(state)
 
-        def loss(params: Params, batch: Batch) -> tuple[Array, Metrics]:
+        def loss(params: Params, batch: Minibatch) -> tuple[Array, Metrics]:
             return self.loss(network, params, batch, least_entropy)
 
         state, metrics = on_policy.update(self, loss, key, state, network, task, trajectory)
@@ -112,7 +120,7 @@ class TRL(OnPolicy):
         return jnp.asarray(schedule(state.initial_entropy, self.target_entropy, progress, self.entropy_temperature))
 
     def loss(
-        self, network: Any, params: Params, batch: Batch, least_entropy: Float[Array, ""]
+        self, network: Any, params: Params, batch: Minibatch, least_entropy: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Metrics]:
         """Surrogate, regression loss, squared value error and entropy bonus of a minibatch."""
         assert batch.action_mean is not None
@@ -130,13 +138,13 @@ class TRL(OnPolicy):
             policy = gaussian_with_std(projected_mean, projected_std)
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
-        policy_loss = -average(ratio * on_policy.standardised(batch.advantage, mask))
+        policy_loss = -average(ratio * on_policy.standardized(batch.advantage, mask))
         value_loss = on_policy.squared_error(value, batch.target, mask)
         goal = jax.lax.stop_gradient((projected_mean, projected_std))
         regression = self.layer.mean_part(mean, *goal)
         if network.std == "state":
             regression += self.layer.cov_part(std, goal[1])
-        regression_loss = self.coefficient * average(regression)
+        regression_loss = self.regression_coefficient * average(regression)
         bonus = average(jnp.asarray(policy.entropy()))
 
         metrics = {

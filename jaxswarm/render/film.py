@@ -14,7 +14,7 @@ from jaxswarm.types import Key
 
 MAX_SHARES = 4_000_000  # numbers in the shares of a film; what is left of 10 MB once a page holds them as text
 
-# Okabe and Ito's colours, which the colour-blind can tell apart
+# Okabe and Ito's colors, which the colour-blind can tell apart
 GROUPS = ("#e69f00", "#009e73", "#cc79a7", "#56b4e9")
 LIGHT: dict[str, Any] = {"agents": "#0072b2", "evaders": "#d55e00", "caught": "#009e73", "groups": GROUPS}
 LIGHT |= {"films": ("#0072b2", "#d55e00", "#009e73", "#cc79a7")}

@@ -1,4 +1,4 @@
-"""Films as pictures: strips of a few frames, and moving pictures. Drawn by Matplotlib, in the colours of the page."""
+"""Films as pictures: strips of a few frames, and moving pictures. Drawn by Matplotlib, in the colors of the page."""
 
 import math
 import shutil
@@ -101,8 +101,8 @@ def draw(axes: Any, film: Film, frame: int) -> None:
         spine.set_linestyle((0, (4, 4)) if is_torus else "solid")
     if film.scenes.goals:
         for place, group in zip(film.scenes.goals.position[0], film.scenes.goals.group[0], strict=True):
-            colour = LIGHT["groups"][group % 4]
-            axes.add_patch(Circle(place, 0.17 * side, facecolor=colour + "33", edgecolor=colour, linewidth=1))
+            color = LIGHT["groups"][group % 4]
+            axes.add_patch(Circle(place, 0.17 * side, facecolor=color + "33", edgecolor=color, linewidth=1))
     for role, bodies in film.scenes.kinds.items():
         _draw_trails(axes, film, role, bodies, frame)
     past = [place for when, place in film.catches if when <= frame]
@@ -124,7 +124,7 @@ def _draw_trails(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
     is_drawn = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=-1) < JUMP * side
     is_drawn &= bodies.is_present[start:frame]
     age = np.broadcast_to((frame - np.arange(start, frame))[:, None], is_drawn.shape)
-    rgb = np.array([to_rgb(colour) for colour in _colours(role, bodies, frame)])
+    rgb = np.array([to_rgb(color) for color in _colours(role, bodies, frame)])
     rgb = np.broadcast_to(rgb, (*is_drawn.shape, 3))
     alpha = 0.1 + 0.7 * (1 - age / (film.trail + 1)) ** 2
     rgba = np.concatenate([rgb, alpha[..., None]], -1)
@@ -142,9 +142,9 @@ def _draw_bodies(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
     is_present = bodies.is_present[frame]
     place = bodies.position[frame][is_present]
     heading = np.zeros(len(place)) if bodies.heading is None else bodies.heading[frame][is_present]
-    colours = np.array(_colours(role, bodies, frame))[is_present]
+    colors = np.array(_colours(role, bodies, frame))[is_present]
     shapes = list(_placed(outline, place, heading, size))
-    axes.add_collection(PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.5, zorder=3))
+    axes.add_collection(PolyCollection(shapes, facecolors=colors, edgecolors="white", linewidths=0.5, zorder=3))
     if role == "agents" and not is_pointed:
         noses = list(_placed(NOSE, place, heading, size))
         axes.add_collection(PolyCollection(noses, facecolors="white", zorder=3))

@@ -1,6 +1,6 @@
 """The square world of robots that push boxes: how it starts, how it moves, and what robots perceive of it.
 
-A robot is a disc, and a box a square, of `rigid2d`; the world has its centre at the origin, with x and y in
+A robot is a disc, and a box a square, of `rigid2d`; the world has its center at the origin, with x and y in
 [-side/2, side/2].
 """
 
@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxswarm import rigid2d
-from jaxswarm.contacts import BOX_SIDE, DISC_RADIUS, MAX_SPEED, MAX_TURN_RATE
-from jaxswarm.geometry import bearing, course, direction, norm
+from jaxswarm.physics import rigid2d
+from jaxswarm.physics.contacts import BOX_SIDE, DISC_RADIUS, MAX_SPEED, MAX_TURN_RATE
+from jaxswarm.physics.geometry import bearing, direction, norm, unit_vector
 from jaxswarm.scene import Bodies, Scene
-from jaxswarm.tasks.swarm import NumberRange, after, draw_number
+from jaxswarm.tasks.swarm import NumberRange, cyclic_others, draw_number
 from jaxswarm.types import Entities, Key, Observation, pytree, static
 
 MARGIN = 0.02  # m, that robots keep off the walls at first
@@ -101,12 +101,12 @@ class Arena:
 
     def view(self, state: State) -> View:
         """What `perceive` needs of a state."""
-        ahead = direction(state.heading)
+        heading_vector = direction(state.heading)
         fraction = jnp.full((self.num_agents, 1), state.box_present.mean())
         return View(
             position=state.position,
-            direction=ahead,
-            own=jnp.concatenate([state.position, ahead[:, ::-1], fraction], -1),
+            direction=heading_vector,
+            own=jnp.concatenate([state.position, heading_vector[:, ::-1], fraction], -1),
             box_position=state.box_position,
             box_direction=direction(state.box_heading),
             box_present=state.box_present,
@@ -115,9 +115,9 @@ class Arena:
     def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
         """What one robot perceives; groups are `neighbors`, in cyclic order from the robot after it on, and `boxes`.
 
-        Own features: x, y, [sin, cos] of the heading, fraction of the boxes that is present. Of neighbours and boxes:
+        Own features: x, y, [sin, cos] of the heading, fraction of the boxes that is present. Of neighbors and boxes:
         distance, [sin, cos] of the counter-clockwise bearing to them, and of their heading less one's own; of boxes
-        also x, y. All in metres.
+        also x, y. All in meters.
         """
 
         def window(leaf: Array, start: Array, size: int) -> Array:
@@ -126,10 +126,12 @@ class Arena:
         def seen(position: Array, heading: Array) -> Array:
             displacement = position - my_position
             distance = norm(displacement)
-            toward = course(displacement, distance)
-            return jnp.concatenate([distance[:, None], _turn(ahead, toward), _turn(ahead, heading)], -1)
+            toward = unit_vector(displacement, distance)
+            return jnp.concatenate(
+                [distance[:, None], _turn(heading_vector, toward), _turn(heading_vector, heading)], -1
+            )
 
-        my_position, ahead = window(view.position, agent, 1), window(view.direction, agent, 1)
+        my_position, heading_vector = window(view.position, agent, 1), window(view.direction, agent, 1)
         num_others = self.num_agents - 1
         others = seen(window(view.position, agent + 1, num_others), window(view.direction, agent + 1, num_others))
         boxes = jnp.concatenate([seen(view.box_position, view.box_direction), view.box_position], -1)
@@ -144,7 +146,7 @@ class Arena:
         """Which body of the scene is in which slot of `perceive`, for all robots."""
         robots = jnp.arange(self.num_agents)
         boxes = jnp.broadcast_to(self.num_agents + jnp.arange(self.num_boxes), (self.num_agents, self.num_boxes))
-        return {"neighbors": jax.vmap(after, (0, None))(robots, self.num_agents), "boxes": boxes}
+        return {"neighbors": jax.vmap(cyclic_others, (0, None))(robots, self.num_agents), "boxes": boxes}
 
     def scene(self, state: State) -> Scene:
         """Discs and squares between walls; boxes are grouped by cluster."""
@@ -155,6 +157,6 @@ class Arena:
         return Scene(-corner, corner, False, robots, boxes=boxes)
 
 
-def _turn(ahead: Float[Array, "*#n 2"], toward: Float[Array, "*#n 2"]) -> Float[Array, "*n 2"]:
+def _turn(heading_vector: Float[Array, "*#n 2"], toward: Float[Array, "*#n 2"]) -> Float[Array, "*n 2"]:
     """[sin, cos] of the counter-clockwise angle from `ahead` to `toward`."""
-    return bearing(ahead, toward)[:, ::-1] * jnp.array([[-1.0, 1.0]])
+    return bearing(heading_vector, toward)[:, ::-1] * jnp.array([[-1.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Robots that push boxes: together (assembly), or apart by colour (clustering); one world, `Arena`, two rewards."""
+"""Robots that push boxes: together (assembly), or apart by color (clustering); one world, `Arena`, two rewards."""
 
 import math
 from typing import ClassVar
@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxswarm import rigid2d
-from jaxswarm.contacts import BOX_SIDE
-from jaxswarm.geometry import norm
+from jaxswarm.physics import rigid2d
+from jaxswarm.physics.contacts import BOX_SIDE
+from jaxswarm.physics.geometry import norm
 from jaxswarm.scene import Goals, Scene
 from jaxswarm.tasks.arena import Arena, State, View
 from jaxswarm.tasks.swarm import NumberRange, require_range
-from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_whole, pytree, require, static
+from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_integer, pytree, require, static
 
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # over the side; where clusters belong, in their order
 
@@ -35,7 +35,7 @@ def _now_and_finally(is_over: Bool[Array, ""], metrics: Metrics) -> Metrics:
 
 
 def _check(task: "Assembly | Clustering") -> None:
-    require(task, "whole numbers from 1", is_whole(1), "num_agents", "num_boxes", "episode_length")
+    require(task, "whole numbers from 1", is_integer(1), "num_agents", "num_boxes", "episode_length")
     at_least = f"sides of a square that a box fits in, from {2 * BOX_SIDE}"
     require(task, at_least, lambda x: 2 * BOX_SIDE <= x < math.inf, "side")
     require(task, ", ".join(rigid2d.PRESETS), lambda x: x in rigid2d.PRESETS, "physics")
@@ -72,7 +72,7 @@ class Assembly:
 
             reward = sum_{i<j} (d_ij before - d_ij after)
 
-        of the distances in metres between the centres of boxes.
+        of the distances in meters between the centers of boxes.
         """
         after = self.arena.move(state, action)
         before_distance, after_distance = _pairs(state.box_position), _pairs(after.box_position)
@@ -109,10 +109,10 @@ class Assembly:
 
 @pytree
 class Clustering:
-    """Robots are to sort boxes by colour (section 5.2.5 of the thesis); the defaults are those of figure 6.9.
+    """Robots are to sort boxes by color (section 5.2.5 of the thesis); the defaults are those of figure 6.9.
 
-    `amplified` rewards boxes of one colour for being close and colours for being apart, `corners` each box for being
-    close to the corner of its colour. Colours are told apart by being `groups` of their own, as in the thesis's
+    `amplified` rewards boxes of one color for being close and colors for being apart, `corners` each box for being
+    close to the corner of its color. Colors are told apart by being `groups` of their own, as in the thesis's
     experiments, or by a `one-hot` after the features of each box, as in its text.
     """
 
@@ -133,7 +133,7 @@ class Clustering:
         require(self, ", ".join(REWARDS), lambda x: x in REWARDS, "reward")
         require(self, ", ".join(IDENTITIES), lambda x: x in IDENTITIES, "cluster_identity")
         most = min(self.num_boxes, len(CORNERS)) if self.reward == "corners" else self.num_boxes
-        require(self, f"whole numbers from 1 to {most}", lambda x: is_whole(1)(x) and x <= most, "num_clusters")
+        require(self, f"whole numbers from 1 to {most}", lambda x: is_integer(1)(x) and x <= most, "num_clusters")
 
     @property
     def cluster(self) -> tuple[int, ...]:

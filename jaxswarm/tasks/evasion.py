@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxswarm.geometry import Space, Torus, norm, unit
+from jaxswarm.physics.geometry import Space, Torus, norm, unit
 
 MAX_SEEN = 10  # pursuers that an evader heeds, on a torus copies of pursuers
 
 
 @partial(jax.jit, inline=True)  # so that steps outside of any other `jit` are fast, too
-def flight(
+def evader_direction(
     space: Space,
     evader: Float[Array, "2"],
     pursuers: Float[Array, "pursuers 2"],

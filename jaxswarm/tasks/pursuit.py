@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxswarm.dynamics import Velocity
-from jaxswarm.geometry import Space, bearing, course, direction, norm
-from jaxswarm.neighbors import Neighborhood, neighborhood
+from jaxswarm.physics.dynamics import Velocity
+from jaxswarm.physics.geometry import Space, bearing, direction, norm, unit_vector
+from jaxswarm.physics.neighbors import Neighborhood, neighborhood
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
-from jaxswarm.tasks.evasion import flight
+from jaxswarm.tasks.evasion import evader_direction
 from jaxswarm.tasks.swarm import NumberRange
-from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_whole, pytree, require, static
+from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_integer, pytree, require, static
 
 EVADER_STRIDE = 2.0  # world units in one step, twice what a pursuer can do
 CATCH_DISTANCE = {"distance": 1.0, "catches": 2.0}  # world units
@@ -63,7 +63,7 @@ class Pursuit:
     unit) ends the episode. With `"catches"` every evader caught (at 2 units) gives 1 and starts anew somewhere else.
     Evaders flee from those that they see within `evader_visibility_radius`, which is also how far they are seen.
     Numbers of agents and evaders are drawn for each episode within `active_agents` and `active_evaders`, if given.
-    With `max_neighbors` agents perceive their nearest neighbours only, in O(num_agents) memory (see `neighbors`).
+    With `max_neighbors` agents perceive their nearest neighbors only, in O(num_agents) memory (see `neighbors`).
     Without `torus` agents know whether they are at a wall: a coordinate up to 1 or from 99 on, as in the thesis's
     program, also where `side` is not 100.
     """
@@ -84,7 +84,7 @@ class Pursuit:
 
     def __post_init__(self) -> None:
         swarm.require_swarm(self, least=1)
-        require(self, "whole numbers from 1", is_whole(1), "num_evaders")
+        require(self, "whole numbers from 1", is_integer(1), "num_evaders")
         swarm.require_range(self, "active_evaders", 1, self.num_evaders)
         require(self, "positive finite numbers", lambda x: 0 < x < math.inf, "evader_visibility_radius")
         require(self, ", ".join(CATCH_DISTANCE), lambda x: x in CATCH_DISTANCE, "reward")
@@ -161,7 +161,7 @@ class Pursuit:
     def _move(self, state: State, action: Float[Array, "agents 2"]) -> State:
         """Evaders first, all from the same state, then agents."""
         is_present = swarm.is_present(state.active_agents, self.num_agents)
-        flee = jax.vmap(flight, (None, 0, None, None, None))
+        flee = jax.vmap(evader_direction, (None, 0, None, None, None))
         way = flee(self.space, state.evader_position, state.position, is_present, self.evader_visibility_radius)
         evader_position = self.space.confine(state.evader_position + EVADER_STRIDE * way)
         state = self.motion.move(self.space, state, action)
@@ -200,7 +200,7 @@ class Pursuit:
         return View(agents, state.active_agents, around.nearest, state.evader_position, state.active_evaders)
 
     def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
-        """What one agent perceives; its neighbours stand in cyclic order, from the agent after it on.
+        """What one agent perceives; its neighbors stand in cyclic order, from the agent after it on.
 
         Own features: fraction of the others that is visible; with walls also whether it is at one. Neighbours':
         distance over visibility_radius, bearing to them and from them as [cos, sin]. Evaders': distance over
@@ -211,7 +211,7 @@ class Pursuit:
         neighbors = _entities(distance, bearings, self.visibility_radius, is_present)
         to_evaders = self.space.displacement(me.position, view.evader_position)
         distance = norm(to_evaders)
-        bearings = bearing(me.direction, course(to_evaders, distance))
+        bearings = bearing(me.direction, unit_vector(to_evaders, distance))
         is_present = swarm.is_present(view.active_evaders, self.num_evaders)
         evaders = _entities(distance, bearings, self.evader_visibility_radius, is_present)
         is_active = None if self.active_agents is None else agent < view.active_agents

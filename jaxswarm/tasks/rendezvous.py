@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxswarm.dynamics import DYNAMICS, Acceleration, Velocity
-from jaxswarm.geometry import Space, direction
-from jaxswarm.neighbors import Neighborhood, neighborhood
+from jaxswarm.physics.dynamics import DYNAMICS, Acceleration, Velocity
+from jaxswarm.physics.geometry import Space, direction
+from jaxswarm.physics.neighbors import Neighborhood, neighborhood
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.swarm import NumberRange, View
 from jaxswarm.types import Entities, Key, Observation, Step, pytree, require, static
 
 RELATIVE_VELOCITY = {
-    "normalised": lambda difference, max_speed: difference / (2 * max_speed),  # in [-1, 1]
+    "normalized": lambda difference, max_speed: difference / (2 * max_speed),  # in [-1, 1]
     "thesis": lambda difference, max_speed: difference * (max_speed / 2),  # a slip of its program; in [-100, 100]
 }
 
@@ -49,7 +49,7 @@ class Rendezvous:
     """The rendezvous of the thesis (section 5.2.1); its figures used the defaults, but "thesis" relative velocities.
 
     With `active_agents` the number of agents of each episode is drawn between these two; `num_agents` is then the most
-    there can be. With `max_neighbors` agents perceive their nearest neighbours only, in O(num_agents) memory (see
+    there can be. With `max_neighbors` agents perceive their nearest neighbors only, in O(num_agents) memory (see
     `neighbors`).
     """
 
@@ -60,7 +60,7 @@ class Rendezvous:
     visibility_radius: float = 100 * math.sqrt(2)
     max_neighbors: int | None = static(default=None)
     dynamics: str = static(default="acceleration")
-    relative_velocity: str = static(default="normalised")
+    relative_velocity: str = static(default="normalized")
     episode_length: int = static(default=1024)
 
     action_dim: ClassVar[int] = 2
@@ -142,7 +142,7 @@ class Rendezvous:
         return View(agents, state.active_agents, around.nearest)
 
     def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
-        """What one agent perceives; its neighbours stand in cyclic order, from the agent after it on.
+        """What one agent perceives; its neighbors stand in cyclic order, from the agent after it on.
 
         Own features: fraction of the others that is visible, and the motion's proprioception. Neighbours': distance
         over the square's diagonal, bearing to them and from them as [cos, sin], relative velocity (own - theirs) in

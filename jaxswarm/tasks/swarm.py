@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxswarm.geometry import Plane, Space, Torus, bearing, course, norm
-from jaxswarm.neighbors import Neighborhood
-from jaxswarm.types import Key, Metrics, is_flag, is_whole, pytree, require
+from jaxswarm.physics.geometry import Plane, Space, Torus, bearing, norm, unit_vector
+from jaxswarm.physics.neighbors import Neighborhood
+from jaxswarm.types import Key, Metrics, is_bool, is_integer, pytree, require
 
 NumberRange = tuple[int, int]  # lowest and highest
 
@@ -25,11 +25,11 @@ class View:
 
 def require_swarm(task: Any, least: int) -> None:
     """Checks the fields that tasks of point swarms share."""
-    require(task, f"whole numbers from {least}", is_whole(least), "num_agents")
-    require(task, "whole numbers from 1", is_whole(1), "episode_length")
-    require(task, "null, whole numbers from 1", lambda x: x is None or is_whole(1)(x), "max_neighbors")
+    require(task, f"whole numbers from {least}", is_integer(least), "num_agents")
+    require(task, "whole numbers from 1", is_integer(1), "episode_length")
+    require(task, "null, whole numbers from 1", lambda x: x is None or is_integer(1)(x), "max_neighbors")
     require(task, "positive finite numbers", lambda x: 0 < x < math.inf, "side", "visibility_radius")
-    require(task, "True, False", is_flag, "torus")
+    require(task, "True, False", is_bool, "torus")
     require_range(task, "active_agents", least, task.num_agents)
 
 
@@ -37,7 +37,7 @@ def require_range(task: Any, name: str, least: int, most: int) -> None:
     """Checks a field that is a range of numbers of which one is drawn for each episode, or None."""
 
     def is_accepted(value: Any) -> bool:
-        is_pair = isinstance(value, tuple) and len(value) == 2 and all(map(is_whole(least), value))
+        is_pair = isinstance(value, tuple) and len(value) == 2 and all(map(is_integer(least), value))
         return value is None or (is_pair and value[0] <= value[1] <= most)
 
     require(task, f"null, a pair (low, high) from {least} to {most}", is_accepted, name)
@@ -66,14 +66,14 @@ def is_present(active: Int[Array, ""], num_slots: int) -> Bool[Array, " slots"]:
 
 
 def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_neighbors: int | None) -> Metrics:
-    """How many visible neighbours agents do not perceive, on average, because there is room for so many only."""
+    """How many visible neighbors agents do not perceive, on average, because there is room for so many only."""
     if max_neighbors is None:
         return {}
     missed = jnp.maximum(neighborhood.num_visible - max_neighbors, 0)
     return {"unseen_neighbors": jnp.where(present, missed, 0.0).sum() / present.sum()}
 
 
-def after(agent: Int[Array, ""], num_agents: int) -> Int[Array, " others"]:
+def cyclic_others(agent: Int[Array, ""], num_agents: int) -> Int[Array, " others"]:
     """All other agents in cyclic order, from the one after it on."""
     index = agent + jnp.arange(1, num_agents)
     return jnp.where(index < num_agents, index, index - num_agents)
@@ -81,7 +81,7 @@ def after(agent: Int[Array, ""], num_agents: int) -> Int[Array, " others"]:
 
 def others(view: View, agent: Int[Array, ""]) -> Int[Array, " others"]:
     """Those whom `pick` gives, in its order; -1 where a list of the nearest ends early."""
-    return after(agent, view.agents.position.shape[0]) if view.nearest is None else view.nearest[agent]
+    return cyclic_others(agent, view.agents.position.shape[0]) if view.nearest is None else view.nearest[agent]
 
 
 def slots(view: View) -> Int[Array, "agents others"]:
@@ -112,6 +112,6 @@ def sight(space: Space, me: Any, them: Any) -> tuple[Float[Array, "others"], Flo
     """Distance; and bearing to them and from them, as [cos, sin] each. In one place, both see the other along x."""
     displacement = space.displacement(me.position, them.position)
     distance = norm(displacement)
-    toward = course(displacement, distance)
+    toward = unit_vector(displacement, distance)
     back = jnp.where(distance[:, None] > 0, -toward, toward)
     return distance, jnp.concatenate([bearing(me.direction, toward), bearing(them.direction, back)], -1)

@@ -1,0 +1,1 @@
+"""Learning curves of run folders: statistics over seeds, plots and labels."""

@@ -1,0 +1,257 @@
+"""Pictures of lines with bands, and the tables of what is in them.
+
+The colors are those of Okabe and Ito (2008) without yellow, which paper swallows; markers tell lines apart without
+color. Each series keeps its place in the order, and with it color and marker.
+"""
+
+import csv
+import dataclasses
+import io
+import math
+import os
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxswarm.analysis.curves import Curve, Line, Points
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+DASHES = ((0, (5, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (9, 2)), (0, (1, 1.2)))  # of references
+FORMATS: dict[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}  # and metadata
+COLUMNS = ("kind", "series", "num_seeds", "x_name", "x", "y_name", "y", "lower", "upper")
+SETTINGS: Any = {  # the same picture is the same file; its words stay words, whatever is in them
+    "svg.hashsalt": "jaxswarm",
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
+    "text.parse_math": False,
+}
+LEGEND_INSIDE = 4  # longer legends are put below the axes, as are those of step lines, which fill all of them
+LINE_LENGTH = 104  # characters of small text that a picture has room for
+UNITS = {  # of an axis: what from which value on
+    "agent_steps": ((1e6, 1e6, "million agent steps"), (1e3, 1e3, "thousand agent steps"), (0, 1, "agent steps")),
+    "wall_seconds": ((7200, 3600, "hours"), (120, 60, "minutes"), (0, 1, "seconds")),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """A line of a picture; `label` is its name, `note` what the legend says of it besides."""
+
+    label: str
+    line: Line
+    note: str = ""
+    is_reference: bool = False
+    censored: Points = dataclasses.field(default_factory=lambda: np.empty(0))  # where seeds ended before the event
+    seeds: Sequence[Curve] = ()  # drawn thin behind the line
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """What is to be drawn, in data units; `log` names the logarithmic axes, `""`, `"x"`, `"y"` or `"xy"`."""
+
+    kind: str
+    series: Sequence[Series]
+    x_name: str
+    y_name: str
+    y_label: str
+    title: str = ""
+    caption: str = ""
+    log: str = ""
+    is_step: bool = False
+
+
+def draw(path: Path, picture: Picture) -> None:
+    """Draws into a file of a format of `FORMATS`, its suffix; a file is there completely or not at all."""
+    from matplotlib import rc_context  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    with rc_context(rc=SETTINGS):
+        figure = Figure(figsize=(7, 4.4), layout="constrained")
+        axes = figure.subplots()
+        shown = _in_units(picture)
+        _draw_lines(axes, shown)
+        _draw_frame(axes, shown)
+        is_inside = not picture.is_step and len(picture.series) <= LEGEND_INSIDE
+        _draw_legend(figure, axes, textwrap.fill(picture.caption, LINE_LENGTH), is_inside)
+        temporary = path.with_name(f".{path.name}.tmp")
+        try:
+            suffix = path.suffix[1:].lower()
+            figure.savefig(temporary, dpi=180, format=suffix, metadata=FORMATS[suffix])
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def table(picture: Picture) -> str:
+    """The points of a picture as CSV, a line each; cells are empty where there is no band or no known number."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for series in picture.series:
+        kind, line = ("reference" if series.is_reference else picture.kind), series.line
+        for n, x, y, lower, upper in zip(line.num_seeds, line.x, line.y, line.lower, line.upper, strict=True):
+            cells = map(_cell, (y, lower, upper))
+            writer.writerow([kind, series.label, n or "", picture.x_name, _cell(x), picture.y_name, *cells])
+        for x, y in zip(series.censored, _heights(line, series.censored), strict=True):
+            writer.writerow(["censored", series.label, 1, picture.x_name, _cell(x), picture.y_name, _cell(y), "", ""])
+    return buffer.getvalue()
+
+
+def seed_count(number: int) -> str:
+    """So many seeds, in words."""
+    return "1 seed" if number == 1 else f"{number} seeds"
+
+
+def check(picture: Picture) -> None:
+    """A `ValueError` for a logarithmic axis that cannot show the values."""
+    x, y = _x_values(picture), _y_values(picture)
+    if "x" in picture.log and not (x > 0).any():
+        raise ValueError(f"log = {picture.log} is not possible: no {picture.x_name} is above zero")
+    if "y" in picture.log and y.min() <= 0 <= y.max():
+        between = f"{y.min():g} to {y.max():g}"
+        raise ValueError(f"log = {picture.log} is not possible: the values of {picture.y_name} go from {between}")
+
+
+def _in_units(picture: Picture) -> Picture:
+    """The picture in the unit of its horizontal axis, after which that is called."""
+    most = _x_values(picture).max(initial=0)
+    units = UNITS.get(picture.x_name, ((-math.inf, 1, picture.x_name),))
+    size, label = next((size, label) for least, size, label in units if most >= least)
+    scaled = [
+        dataclasses.replace(
+            series,
+            line=dataclasses.replace(series.line, x=series.line.x / size),
+            censored=series.censored / size,
+            seeds=[dataclasses.replace(seed, x=seed.x / size) for seed in series.seeds],
+        )
+        for series in picture.series
+    ]
+    return dataclasses.replace(picture, series=scaled, x_name=label)
+
+
+def _draw_lines(axes: "Axes", picture: Picture) -> None:
+    """Our lines by their place, the references behind them in a tint of the color of the line with the same name.
+
+    Those without a namesake have tints of the colors that remain.
+    """
+    ours = [series for series in picture.series if not series.is_reference]
+    references = [series for series in picture.series if series.is_reference]
+    for number, series in enumerate(ours):
+        style = {"color": COLORS[number % len(COLORS)], "linewidth": 1.8, "zorder": 4}
+        every = max(1, len(series.line.x) // 12)
+        marker = MARKERS[(number + number // len(COLORS)) % len(MARKERS)]  # another one when colors come again
+        marks = {"marker": marker, "markersize": 4, "markevery": (number % every, every)}
+        style |= marks | ({"drawstyle": "steps-post"} if picture.is_step else {})
+        _draw_line(axes, series, picture.is_step, 0.2, style)
+    labels = list(dict.fromkeys(series.label for series in [*ours, *references]))
+    for number, series in enumerate(references):
+        color = _tint(COLORS[labels.index(series.label) % len(COLORS)])
+        style = {"color": color, "linewidth": 1.4, "linestyle": DASHES[number % len(DASHES)], "zorder": 2}
+        _draw_line(axes, series, picture.is_step, 0.12, style)
+    if len(ours) == 1 and not references and len(ours[0].line.x) and not picture.is_step:
+        end, text = (ours[0].line.x[-1], ours[0].line.y[-1]), _signed(ours[0].line.y[-1])
+        ground = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+        axes.annotate(text, end, (6, 0), textcoords="offset points", va="center", annotation_clip=False, bbox=ground)
+
+
+def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, style: dict[str, Any]) -> None:
+    """Line, band, seeds and marks; pale where some seeds have ended."""
+    line = series.line
+    for seed in series.seeds:
+        axes.plot(seed.x, seed.y, color=style["color"], alpha=0.4, linewidth=0.6, zorder=3)
+    behind = {"color": style["color"], "alpha": band_alpha, "linewidth": 0, "zorder": 1}
+    axes.fill_between(line.x, line.lower, line.upper, step="post" if is_step else None, **behind)
+    is_integer = (line.num_seeds == line.num_seeds.max(initial=0)) | is_step
+    if not is_integer.all():
+        axes.plot(line.x, line.y, alpha=0.45, **style)
+    label = f"{series.label} ({series.note})" if series.label and series.note else series.label or series.note
+    axes.plot(line.x, np.where(is_integer, line.y, math.nan), label=label, **style)
+    ticks = {"color": style["color"], "markersize": 10, "markeredgewidth": 1.8, "zorder": 5}
+    axes.plot(series.censored, _heights(line, series.censored), "|", **ticks)
+
+
+def _draw_frame(axes: "Axes", picture: Picture) -> None:
+    axes.set_title(picture.title, loc="left", fontsize=11)
+    axes.set_xlabel(picture.x_name)
+    axes.set_ylabel(picture.y_label)
+    if "x" in picture.log:
+        _set_logarithmic(axes, "x", _x_values(picture))
+    if "y" in picture.log:
+        _set_logarithmic(axes, "y", _y_values(picture))
+    axes.grid(color="0.92", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _set_logarithmic(axes: "Axes", name: str, values: np.ndarray) -> None:
+    """A logarithmic axis with ticks at 1, 2, 5, 10, ...; of negative numbers it is the mirror image."""
+    from matplotlib import ticker  # noqa: PLC0415
+
+    axis, subs = getattr(axes, f"{name}axis"), (1.0, 2.0, 5.0)
+    if values.max() > 0:
+        getattr(axes, f"set_{name}scale")("log", nonpositive="mask")
+        axis.set_major_locator(ticker.LogLocator(subs=subs))
+    else:
+        nearest = -values.max() / 1.15
+        axes.set_yscale("symlog", linthresh=nearest)
+        axes.set_ylim(1.15 * values.min(), -nearest)
+        axis.set_major_locator(ticker.SymmetricalLogLocator(base=10, linthresh=nearest, subs=subs))
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: _signed(value)))
+    axis.set_minor_formatter(ticker.NullFormatter())
+
+
+def _draw_legend(figure: "Figure", axes: "Axes", caption: str, is_inside: bool) -> None:
+    """A legend in the axes, or below them in a figure that grows by it; the caption is always below."""
+    handles, labels = axes.get_legend_handles_labels()
+    labels = [textwrap.fill(label, LINE_LENGTH - 10) for label in labels]
+    style: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelspacing": 0.35}
+    if is_inside or not labels:
+        if labels:
+            axes.legend(handles, labels, **style)
+        if caption:
+            figure.supxlabel(caption, x=0.01, ha="left", fontsize=8, color="0.35")
+        return
+    columns = 2 if len(labels) > 1 and max(map(len, labels)) <= LINE_LENGTH // 2 - 8 else 1
+    num_lines = sum(1 + label.count("\n") for label in labels) / columns + 1 + caption.count("\n")
+    figure.set_figheight(figure.get_figheight() + 0.17 * math.ceil(num_lines))
+    style |= {"title": caption, "title_fontsize": 8, "alignment": "left", "ncols": columns}
+    figure.legend(handles, labels, loc="outside lower left", **style).get_title().set_color("0.35")
+
+
+def _x_values(picture: Picture) -> np.ndarray:
+    return np.concatenate([np.empty(0), *(series.line.x for series in picture.series)])
+
+
+def _y_values(picture: Picture) -> np.ndarray:
+    """All finite heights, bands and seeds included."""
+    lines = [series.line for series in picture.series]
+    seeds = [seed.y for series in picture.series for seed in series.seeds]
+    values = np.concatenate([np.empty(0), *seeds, *(x for line in lines for x in (line.y, line.lower, line.upper))])
+    return values[np.isfinite(values)]
+
+
+def _heights(line: Line, at: Points) -> Points:
+    """Where a step line is at these points."""
+    return line.y[np.searchsorted(line.x, at, side="right") - 1]
+
+
+def _tint(color: str) -> str:
+    """Two fifths of the way to white."""
+    channels = (int(color[i : i + 2], 16) for i in (1, 3, 5))
+    return "#" + "".join(f"{(3 * channel + 2 * 255) // 5:02x}" for channel in channels)
+
+
+def _signed(value: float) -> str:
+    return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else repr(float(value))

@@ -1,0 +1,5 @@
+"""Tasks with the interfaces of other libraries."""
+
+from jaxswarm.bridges.gymnax import Gymnax
+
+__all__ = ["Gymnax"]

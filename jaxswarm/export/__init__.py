@@ -1,0 +1,5 @@
+"""Trained policies as files that run without jaxswarm."""
+
+from jaxswarm.export.program import PLATFORMS, export_policy
+
+__all__ = ["PLATFORMS", "export_policy"]

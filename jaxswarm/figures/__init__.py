@@ -1,0 +1,1 @@
+"""The figures of the thesis: their runs, their claims and the report."""

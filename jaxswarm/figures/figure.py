@@ -1,0 +1,261 @@
+"""The figures of the thesis: what was run for them, its curves, and what these show.
+
+A figure is a file in `configs/figure`: its series as words for `jaxswarm-train`, and its claims. Series that are the
+same experiment share a run folder, whichever figures they are in.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxswarm import config as configs
+from jaxswarm import files
+from jaxswarm.analysis import curves, plots
+from jaxswarm.analysis import run_folders as runs
+from jaxswarm.analysis.curves import Line
+from jaxswarm.analysis.plots import Picture, Series
+from jaxswarm.analysis.run_folders import RunFolder
+from jaxswarm.config import Config, ConfigError
+from jaxswarm.figures import claims
+from jaxswarm.figures.claims import Claim, Measured, Verdict
+from jaxswarm.files import RETURN, replace_text
+from jaxswarm.studies.trials import Trial
+
+CURVES = Path(__file__).resolve().parent.parent / "data" / "curves"  # of the thesis
+FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables
+KEPT_OF_MANIFEST = ("started", "versions", "platform", "device", "git_revision")
+KEPT_OF_ROWS = ("update", "agent_steps", "wall_seconds", "seed", RETURN)
+NUM_BOOTSTRAP = 200  # times that seeds are redrawn, to see how certain a claim is
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """What a figure's file says, and the curves of the thesis by the names of the series, which may be none.
+
+    Figures of the thesis name their series as it does; others say by `thesis` beside which of its series each is.
+    """
+
+    name: str
+    title: str
+    series: Mapping[str, tuple[str, ...]]  # words for `configs.compose`
+    claims: tuple[Claim, ...]
+    references: Mapping[str, Line]
+    thesis: Mapping[str, str]  # names of the references there
+    num_updates: int  # shown; the thesis trained some series for longer
+    num_seeds: int  # of each series, from which on there is a verdict
+    best_share: float  # of the seeds, which is shown: those with the highest means over their curves
+    y: tuple[str, ...]  # the pictures, linear and log
+
+    @property
+    def num_shown(self) -> int:
+        """Seeds of a series that are shown, of those from which on there is a verdict."""
+        return curves.num_best(self.num_seeds, self.best_share)
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """File names, and logarithmic axes."""
+        return {self.name if scale == "linear" else f"{self.name}_{scale}": "y" * (scale == "log") for scale in self.y}
+
+
+def names() -> list[str]:
+    """All figures, in the order of the thesis, then our own."""
+    found = (path.stem for path in (configs.config_dir() / configs.FIGURES).glob("*.yaml"))
+
+    def place(name: str) -> tuple:
+        parts = [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in name.split("_")]
+        return name.startswith("best_"), parts
+
+    return sorted(found, key=place)
+
+
+def load(name: str) -> Figure:
+    """The figure of this name; a `ConfigError` lists those that there are."""
+    if name not in names():
+        raise ConfigError(f"{name} is no figure; accepted: all, {', '.join(names())}")
+    fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
+    overrides, reference = fields.pop("overrides").split(), fields.pop("reference", None)
+    thesis = fields.pop("thesis", None) or {series: series for series in fields["series"]}
+    fields["series"] = {series: (*overrides, *own.split()) for series, own in fields["series"].items()}
+    fields["claims"] = tuple(_claim(**claim) for claim in fields["claims"])
+    fields["y"] = tuple(fields.pop("y", ["linear"]))
+    fields["best_share"] = float(fields.pop("best_share", 1.0))
+    lines = curves.read_lines(CURVES / f"{reference}.csv") if reference else {}
+    references = {own: lines[theirs] for own, theirs in thesis.items() if lines}
+    return Figure(name=name, references=references, thesis=thesis, **fields)
+
+
+def stored(*directories: Path) -> list[RunFolder]:
+    """All runs in the directories, of any figure; of folders with the same name the longest one."""
+    found: dict[str, RunFolder] = {}
+    for directory in directories:
+        for config in sorted(directory.glob("*/config.yaml")):
+            folder = runs.read(config.parent)
+            found[folder.path.name] = max(found.get(folder.path.name, folder), folder, key=lambda one: len(one.rows))
+    return list(found.values())
+
+
+def keep(folder: RunFolder, directory: Path) -> None:
+    """Copies the little that reports read of a run: config, evaluations, and where it was trained by what code."""
+    kept = directory / folder.path.name
+    if kept.resolve() == folder.path.resolve():
+        return
+    kept.mkdir(parents=True, exist_ok=True)
+    replace_text(kept / "config.yaml", (folder.path / "config.yaml").read_text())
+    manifest = {name: x for name, x in _manifest(folder).items() if name in KEPT_OF_MANIFEST}
+    replace_text(kept / "manifest.json", json.dumps(manifest, indent=2) + "\n")
+    of_evaluations = [{name: x for name, x in row.items() if name in KEPT_OF_ROWS} for row in folder.rows]
+    files.write_rows(kept / "metrics.csv", of_evaluations)
+
+
+def plan(
+    figure: Figure,
+    directory: Path,
+    found: Sequence[RunFolder] = (),
+    num_seeds: int | None = None,
+    scale: float = 1.0,
+    overrides: Sequence[str] = (),
+) -> dict[str, list[Trial]]:
+    """The trials of each series: those in folders that were found to hold some of its seeds, and new ones for the rest.
+
+    They are `scale` times as long as what the figure shows of it; `words` change all series.
+    """
+    wanted = {
+        series: _cut(figure, [*own, *overrides], num_seeds or figure.num_seeds, scale)
+        for series, own in figure.series.items()
+    }
+    return {series: _trials(config, directory, found) for series, config in wanted.items()}
+
+
+def is_finished(trial: Trial) -> bool:
+    """Whether its folder has been trained for as long, or longer for another figure."""
+    path = trial.run_dir / "metrics.csv"
+    rows = files.read_rows(path) if path.exists() else []
+    return any(row["update"] >= trial.num_updates for row in rows)
+
+
+def measure(
+    figure: Figure, trials: Mapping[str, Sequence[Trial]], found: Sequence[RunFolder], warn: Callable[[str], object]
+) -> dict[str, Measured]:
+    """What all seeds of the figure's series came to that any run holds; series without any are left out.
+
+    As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
+    """
+    measured, generator = {}, np.random.default_rng(0)
+    for series, (trial, *_) in trials.items():
+        per_update = trial.experiment.agent_steps_per_update
+        end = float(figure.num_updates * per_update)
+        same = [folder for folder in found if is_of(folder, trial.config)]
+        seeds = runs.seeds(same, "agent_steps", RETURN, warn, once=True) if any(folder.rows for folder in same) else []
+        if seeds:
+            shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
+            line = _until(curves.summarize(shifted, "median", figure.best_share), end)
+            bootstrapped = curves.bootstrapped(shifted, "median", NUM_BOOTSTRAP, generator, figure.best_share)
+            bootstrapped = tuple(_until(one, end) for one in bootstrapped)
+            reference = figure.references.get(series)
+            end = min(end, float(reference.x[-1])) if reference else end
+            measured[series] = Measured(line, reference or line, end, bootstrapped)
+    return measured
+
+
+def is_of(folder: RunFolder, config: Config) -> bool:
+    """Whether a folder's runs are those of the config, but for their seeds and length."""
+    if folder.config != runs.fields(config):
+        return False
+    return configs.read(folder.path / "config.yaml").get("eval_every") == config["eval_every"]
+
+
+def origin(folder: RunFolder) -> tuple[str, str]:
+    """On what device it was trained, and by what revision of the code, in its last session."""
+    manifest = _manifest(folder)
+    device = manifest.get("device", {}).get("backend", "unknown devices")
+    return device, (manifest.get("git_revision") or "unknown")[:12]
+
+
+def of_thesis(figure: Figure) -> dict[str, Measured]:
+    """The curves of the thesis, measured as ours are."""
+    return {name: Measured(line, line, float(line.x[-1])) for name, line in figure.references.items()}
+
+
+def verdicts(figure: Figure, measured: Mapping[str, Measured]) -> list[Verdict]:
+    """One for each claim."""
+    theirs = of_thesis(figure)
+    return [claims.judge(claim, measured, theirs, figure.num_shown) for claim in figure.claims]
+
+
+def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
+    """Draws the figure with the curves of the thesis behind ours, and writes the points beside; returns the files."""
+    counts = {name: plots.seed_count(int(ours.line.num_seeds.max())) for name, ours in measured.items()}
+    series = [Series(name, ours.line, counts[name]) for name, ours in measured.items()]
+    for name, line in figure.references.items():
+        source = "thesis" if figure.thesis[name] == name else f"thesis: {figure.thesis[name]}"
+        series.append(Series(name, line, f"{source}, {line.num_seeds[0]} runs", is_reference=True))
+    seeds = "seeds" if figure.best_share == 1 else f"the best {figure.best_share:.0%} of the seeds"
+    caption = f"Median and quartiles over {seeds}" + ("; dashed: the thesis" if figure.references else "")
+    out.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, log in figure.pictures.items():
+        label = "return of an episode"
+        picture = Picture("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
+        plots.draw(out / f"{name}.png", picture)
+        replace_text(out / f"{figure.name}.csv", plots.table(picture))
+        files.append(out / f"{name}.png")
+    return [*files, out / f"{figure.name}.csv"]
+
+
+def _manifest(folder: RunFolder) -> dict[str, Any]:
+    try:
+        return json.loads((folder.path / "manifest.json").read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def _claim(says: str, kind: str, series: Sequence[str], **numbers: int | float) -> Claim:
+    return Claim(says, kind, tuple(series), **{name: float(x) for name, x in numbers.items()})
+
+
+def _cut(figure: Figure, overrides: Sequence[str], num_seeds: int, scale: float) -> Config:
+    config = configs.compose(overrides)
+    total = configs.run_settings(config).length(configs.build(config).agent_steps_per_update)
+    num_updates = min(max(1, math.ceil(scale * figure.num_updates - 1e-9)), total)
+    return configs.override(config, [("num_updates", num_updates), ("num_seeds", num_seeds)])
+
+
+def _trials(config: Config, directory: Path, found: Sequence[RunFolder]) -> list[Trial]:
+    """Folders that hold seeds which no larger one holds, then a new folder for each range of seeds that none does."""
+    experiment, missing = configs.build(config), set(configs.run_settings(config).seeds)
+    held = {
+        folder.path: configs.run_settings(configs.load(folder.path / "config.yaml")).seeds
+        for folder in found
+        if is_of(folder, config)
+    }
+    parts = "-".join(config[part]["name"] for part in configs.REGISTERED)
+    digest = hashlib.sha256(json.dumps(runs.fields(config), sort_keys=True).encode()).hexdigest()[:8]
+    trials = []
+
+    def add(path: Path, seeds: Sequence[int]) -> None:
+        trials.append(
+            Trial(configs.override(config, [("seed", seeds[0]), ("num_seeds", len(seeds))]), experiment, path)
+        )
+        missing.difference_update(seeds)
+
+    for path, seeds in sorted(held.items(), key=lambda item: -len(item[1])):
+        if missing.intersection(seeds):
+            add(path, seeds)
+    while missing:
+        first = last = min(missing)
+        while last + 1 in missing:
+            last += 1
+        add(directory / f"{parts}-{digest}-seeds-{first}-{last}", range(first, last + 1))
+    return trials
+
+
+def _until(line: Line, end: float) -> Line:
+    """The part of a line that a figure shows, and at least its first point."""
+    size = max(1, int(np.searchsorted(line.x, end * (1 + 1e-9), side="right")))
+    return Line(line.x[:size], line.y[:size], line.lower[:size], line.upper[:size], line.num_seeds[:size])

@@ -1,0 +1,264 @@
+"""Many runs of one shape in one program: several seeds, several numbers, spread over all devices.
+
+A batch of runs is an `Experiment` and a `TrainState` whose leaves have one more axis, the first, of runs. Each device
+has its share of the runs and trains `width` of them at a time, side by side, one such group after the other. Where
+there are more devices than runs, the worlds of a run are spread over several: arithmetic is that of one device, and
+XLA adds up gradients across devices.
+"""
+
+import contextlib
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import psutil
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, UInt
+
+from jaxswarm.rollout import ENVS_AXIS
+from jaxswarm.training import Experiment, TrainState, evaluate, init, train_chunk
+from jaxswarm.types import Metrics
+
+RUNS_AXIS = "runs"
+CPU_WIDTH = 1  # runs side by side on a CPU, whose cache holds the activations of one; measured, see benchmarks/LOG.md
+MEMORY_SHARE = 0.9  # of what is free that a program may take
+LESS_MEMORY = "smaller num_envs, num_steps, num_seeds, num_eval_envs or learner.batch_size need less"
+
+Program = Callable[[Experiment, TrainState, Any], tuple[TrainState, Metrics]]  # the last: how many updates
+
+
+class RunBatch(NamedTuple):
+    """Runs in one program."""
+
+    experiments: Experiment  # leaves [runs]
+    mesh: Mesh | None  # over the devices; None: there is one
+
+    @property
+    def num_runs(self) -> int:
+        """How many."""
+        return jax.tree.leaves(self.experiments)[0].shape[0]
+
+
+def use_cores(num_runs: int) -> None:
+    """Makes each core of a CPU a device that trains runs of its own; has to come before any device is used.
+
+    Two cores then train two runs in half the time that both take for one after the other; see benchmarks/LOG.md. Does
+    nothing where devices are in use already, or the environment says how many there are.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    is_decided = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not is_decided and "JAX_COORDINATOR_ADDRESS" not in os.environ:
+        with contextlib.suppress(RuntimeError):  # devices are in use
+            jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
+
+
+def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> RunBatch:
+    """`num_seeds` runs of each experiment, one after the other; the experiments differ in numbers only."""
+    leaves = [jax.tree.leaves(experiment) for experiment in experiments]
+    structures = {jax.tree.structure(experiment) for experiment in experiments}
+    if len(structures) > 1:
+        raise ValueError("experiments differ in what fixes a program's shapes; accepted: such as differ in numbers")
+    stacked = [np.repeat(_stack(x), num_seeds, axis=0) for x in zip(*leaves, strict=True)]
+    batch = jax.tree.unflatten(structures.pop(), stacked)
+    return RunBatch(batch, make_mesh(len(experiments) * num_seeds, experiments[0].num_envs))
+
+
+def _stack(numbers: Sequence[Any]) -> np.ndarray:
+    """One row per experiment, in JAX's own precision."""
+    stacked = np.stack([np.asarray(x) for x in numbers])
+    return stacked.astype(jax.dtypes.canonicalize_dtype(stacked.dtype))
+
+
+def make_mesh(num_runs: int, num_envs: int) -> Mesh | None:
+    """As many devices as divide runs and worlds, `None` if that is one; several processes need all of theirs."""
+    num_devices = jax.device_count()
+    runs, envs = mesh_shape(num_runs, num_envs, num_devices)
+    if jax.process_count() > 1 and runs * envs < num_devices:
+        raise ValueError(
+            f"{num_runs} runs of {num_envs} worlds cannot be spread over {num_devices} devices; "
+            "accepted: numbers of runs or worlds that they divide"
+        )
+    if runs * envs == 1:
+        return None
+    axes = (AxisType.Auto, AxisType.Auto)
+    return jax.make_mesh((runs, envs), (RUNS_AXIS, ENVS_AXIS), axes, devices=jax.devices()[: runs * envs])
+
+
+def mesh_shape(num_runs: int, num_envs: int, num_devices: int) -> tuple[int, int]:
+    """How many devices share the runs and, of each of these, how many its worlds: as many as divide both."""
+    shapes = [
+        (runs, math.gcd(num_envs, num_devices // runs)) for runs in range(1, num_devices + 1) if num_runs % runs == 0
+    ]
+    return max(shapes, key=lambda shape: (math.prod(shape), shape))
+
+
+def place(batch: RunBatch, states: TrainState) -> TrainState:
+    """The states where the batch is computed."""
+    raw = jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x), states)
+    impls = jax.tree.map(lambda x: str(jax.random.key_impl(x)) if _is_key(x) else "", states)
+
+    def wrapped(raw: Any) -> TrainState:
+        return jax.tree.map(lambda x, impl: jax.random.wrap_key_data(x, impl=impl) if impl else x, raw, impls)
+
+    return jax.jit(wrapped, out_shardings=_shardings(batch.mesh, states))(raw)
+
+
+def init_batch(batch: RunBatch, seeds: Sequence[int]) -> TrainState:
+    """States before the first update, one for each run; those of the same seeds alone, bit by bit."""
+    seeds_array = np.asarray(seeds, np.uint32)
+    shapes = jax.eval_shape(_start, batch.experiments, seeds_array)
+    return jax.jit(_start, out_shardings=_shardings(batch.mesh, shapes))(batch.experiments, seeds_array)
+
+
+def with_params(states: TrainState, params: Sequence[Any]) -> TrainState:
+    """The states with these parameters, of one network for each run."""
+    given = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *params)
+    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), given, states.learner.params)
+    return dataclasses.replace(states, learner=dataclasses.replace(states.learner, params=placed))
+
+
+def _start(experiments: Experiment, seeds: UInt[Any, " runs"]) -> TrainState:
+    return jax.lax.map(lambda run: init(run[0], jax.random.key(run[1])), (experiments, seeds))
+
+
+def _shardings(mesh: Mesh | None, states: TrainState) -> Any:
+    """Where the leaves of states are; `None`: on the one device."""
+    if mesh is None:
+        return None
+    by_run, by_env = (NamedSharding(mesh, spec) for spec in (P(RUNS_AXIS), P(RUNS_AXIS, ENVS_AXIS)))
+    spread = jax.tree.map(lambda _: by_run, states)
+    return spread.replace(envs=jax.tree.map(lambda _: by_env, states.envs))
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def compile_batch(batch: RunBatch, states: TrainState, size: int, warn: Callable[[str], None]) -> Program:
+    """`train_chunk` of every run, donating the states; as many runs side by side as memory holds.
+
+    Where memory holds not even one, it says so before anything is computed.
+    """
+    num_local = batch.num_runs // (batch.mesh.shape[RUNS_AXIS] if batch.mesh else 1)
+    width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
+    while True:
+        with _on(batch):
+            lowered = _advance.lower(batch.experiments, states, np.int32(0), size, width, batch.mesh)
+            program = lowered.compile(compiler_options())
+        needed, free = _memory(program), _free_memory()
+        if needed <= free:
+            break
+        sizes = f"{needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free"
+        if width == 1:
+            warn(f"training needs {sizes}; {LESS_MEMORY}")
+            break
+        smaller = [n for n in range(1, width) if num_local % n == 0]
+        width = max(n for n in smaller if n == 1 or n <= width * free / needed)
+        warn(f"{num_local} runs side by side need {sizes}: {width} at a time")
+
+    return lambda experiments, states, num_updates: program(experiments, states, np.int32(num_updates))
+
+
+def compiler_options() -> dict[str, Any] | None:
+    """What XLA is told beside its defaults: to use vectors of 512 bits where a CPU has them; see benchmarks/LOG.md."""
+    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
+
+
+@partial(jax.jit, static_argnames=("size", "width", "mesh"), donate_argnames="states")
+def _advance(
+    experiments: Experiment, states: TrainState, num_updates: Array, size: int, width: int, mesh: Mesh | None
+) -> tuple[TrainState, Metrics]:
+    return _spread(mesh, partial(train_chunk, size=size), width)(experiments, states, num_updates)
+
+
+def evaluate_batch(batch: RunBatch, states: TrainState) -> Metrics:
+    """`evaluate` of every run; metrics [runs]."""
+    with _on(batch):
+        return _evaluate(batch.experiments, states, batch.mesh)
+
+
+@partial(jax.jit, static_argnames="mesh")
+def _evaluate(experiments: Experiment, states: TrainState, mesh: Mesh | None) -> Metrics:
+    return _spread(mesh, evaluate, 1)(experiments, states)
+
+
+def fetch(batch: RunBatch, tree: Any) -> Any:
+    """The tree on this process's own device, wherever its parts are; a call that all processes have to make."""
+    if jax.process_count() == 1 or batch.mesh is None:
+        return tree
+    everywhere = jax.jit(lambda x: x, out_shardings=NamedSharding(batch.mesh, P()))
+
+    def local(x: Array) -> Array:  # one after the other: processes have to communicate in the same order
+        return jax.block_until_ready(everywhere(x)).addressable_data(0)
+
+    return jax.tree.map(local, tree)
+
+
+def _on(batch: RunBatch) -> contextlib.AbstractContextManager:
+    return contextlib.nullcontext() if batch.mesh is None else jax.set_mesh(batch.mesh)
+
+
+def _spread(mesh: Mesh | None, function: Callable, width: int) -> Callable:
+    """The function of one run, and of what is common to all, for all runs; each device takes those that it has."""
+
+    def local(experiments: Experiment, states: TrainState, *common: Array) -> Any:
+        def one(run: tuple[Experiment, TrainState]) -> Any:
+            return function(*run, *common)
+
+        runs, num_local = (experiments, states), states.update.shape[0]
+        if num_local == 1:  # no loop: exactly the program of one run
+            return jax.tree.map(lambda x: x[None], one(jax.tree.map(lambda x: x[0], runs)))
+        if width == num_local:
+            return jax.vmap(one)(runs)
+        return jax.lax.map(one, runs, batch_size=None if width == 1 else width)
+
+    if mesh is None:
+        return local
+    by_run = P(RUNS_AXIS)
+
+    def spread(experiments: Experiment, states: TrainState, *common: Array) -> Any:
+        specs = (by_run, by_run, *[P()] * len(common))
+        return jax.shard_map(
+            local, mesh=mesh, in_specs=specs, out_specs=by_run, axis_names={RUNS_AXIS}, check_vma=False
+        )(experiments, states, *common)
+
+    return spread
+
+
+def _memory(program: Any) -> int:
+    """Bytes that a device needs to run it; 0 if that is not known."""
+    analysis = program.memory_analysis()
+    if analysis is None:
+        return 0
+    sizes = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
+    return sizes - analysis.alias_size_in_bytes
+
+
+def _allotted(folder: Path = Path("/sys/fs/cgroup")) -> float:
+    """Bytes that a container may still take; infinite without a limit. Files are dropped from memory where needed."""
+    places = (
+        (folder, "memory.max", "memory.current"),
+        (folder / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),  # of cgroups of version 1
+    )
+    for place, limit, used in places:
+        with contextlib.suppress(OSError, ValueError):  # no such limit, or "max"
+            stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
+            files = int(stat.get("inactive_file", stat.get("total_inactive_file", 0)))
+            return float(int((place / limit).read_text()) - int((place / used).read_text()) + files)
+    return math.inf
+
+
+def _free_memory() -> float:
+    """Bytes that a program may take on each device; infinite if that is not known."""
+    if jax.default_backend() == "cpu":
+        return MEMORY_SHARE * min(psutil.virtual_memory().available, _allotted()) / jax.local_device_count()
+    stats = jax.local_devices()[0].memory_stats()
+    return MEMORY_SHARE * (stats["bytes_limit"] - stats["bytes_in_use"]) if stats else math.inf

@@ -1,0 +1,90 @@
+"""`manifest.json`: versions, device, revision, and the exact numbers of steps of a run."""
+
+import importlib.metadata
+import json
+import math
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxswarm.files import replace_text
+from jaxswarm.learners.on_policy import OnPolicy, batch_size
+
+PACKAGES = ("jaxswarm", "jax", "jaxlib", "flax", "optax", "distrax", "orbax-checkpoint", "numpy")
+
+
+def describe(experiment: Any, num_updates: int, seeds: Sequence[int]) -> dict[str, Any]:
+    """Versions, device, revision and the exact arithmetic of steps."""
+    per_update = experiment.agent_steps_per_update
+    steps = {
+        "updates": num_updates,
+        "num_agents": experiment.task.num_agents,
+        "num_envs": experiment.num_envs,
+        "steps_per_world_and_update": experiment.num_steps,
+        "environment_steps_per_update": experiment.num_envs * experiment.num_steps,
+        "agent_steps_per_update": per_update,
+        "environment_steps": num_updates * experiment.num_envs * experiment.num_steps,
+        "agent_steps": num_updates * per_update,
+        "evaluations": math.ceil(num_updates / experiment.eval_every) + 1,
+        "episodes_per_evaluation": experiment.num_eval_envs,
+    }
+    if isinstance(experiment.learner, OnPolicy):
+        size = batch_size(experiment.learner, per_update, experiment.task.num_agents)
+        gradient_steps = experiment.learner.num_epochs * per_update // size
+        steps |= {
+            "samples_per_gradient_step": size,
+            "gradient_steps_per_update": gradient_steps,
+            "gradient_steps": num_updates * gradient_steps,
+        }
+    return {
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": sys.argv,
+        "seeds": list(seeds),
+        "steps": steps,
+    } | provenance()
+
+
+def provenance() -> dict[str, Any]:
+    """What code ran on what machine."""
+    device = jax.devices()[0]
+    return {
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES},
+        "platform": f"{platform.system()} {platform.machine()}",
+        "device": {"backend": device.platform, "kind": device.device_kind, "count": jax.device_count()},
+        "git_revision": _git_revision(),
+    }
+
+
+def write_manifest(path: Path, content: dict[str, Any]) -> None:
+    """Writes the manifest; a resumed run adds its own beside those of the sessions before."""
+    try:
+        before = json.loads(path.read_text())
+        content = content | {"earlier_sessions": [*before.pop("earlier_sessions", []), before]}
+    except (OSError, ValueError):
+        pass
+    replace_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git_revision() -> str | None:
+    """Commit of the checkout that this package runs from, marked if files differ from it."""
+    checkout = Path(__file__).resolve().parent.parent.parent
+    if not (checkout / ".git").exists():
+        return None
+    try:
+        command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None

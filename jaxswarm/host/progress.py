@@ -1,0 +1,100 @@
+"""Progress of training: a bar on a terminal, a line now and then elsewhere."""
+
+import importlib.util
+import math
+import time
+from typing import Any
+
+SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal to draw a bar on
+
+
+class Progress:
+    """Rate, latest evaluation and time left: a bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, update: int, num_updates: int, agent_steps_per_update: int, is_shown: bool = True):
+        self._num_updates = num_updates
+        self._agent_steps_per_update = agent_steps_per_update
+        self._is_shown = is_shown
+        self._first: tuple[float, int] | None = None  # when the first chunk was done
+        self._last_line = -math.inf
+        self._started = time.monotonic()
+        self._update = update
+        self._bar = self._make_bar() if is_shown else None
+
+    def __enter__(self) -> "Progress":
+        if self._bar:
+            self._bar.start()
+        elif self._is_shown:
+            print("compiling ...", flush=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def begin(self) -> None:
+        """Shows that compiling is over: the first chunk of a slow run takes minutes."""
+        if self._bar:
+            self._bar.update(self._task, rate="training")
+        elif self._is_shown:
+            print(f"compiled in {time.monotonic() - self._started:.0f} s; training ...", flush=True)
+
+    def advance(self, update: int, evaluation: float | None) -> None:
+        """Shows that so many updates are done; `evaluation` is the latest return."""
+        now = time.monotonic()
+        self._update = update
+        self._first = self._first or (now, update)
+        seconds, updates = now - self._first[0], update - self._first[1]
+        rate = updates * self._agent_steps_per_update / seconds if updates else math.nan
+        left = (self._num_updates - update) * seconds / updates if updates else math.nan
+        return_text = "-" if evaluation is None else f"{evaluation:.1f}"
+        rate_text = f"{_short(rate)} agent steps/s" if updates else "measuring speed"
+        left_text = f"{_clock(left)} left" if updates else "-:-- left"
+        if self._bar:
+            self._bar.update(
+                self._task, completed=update, rate=rate_text, evaluation=f"return {return_text}", left=left_text
+            )
+        elif self._is_shown and (now - self._last_line >= SECONDS_BETWEEN_LINES or update == self._num_updates):
+            self._last_line = now
+            done = f"update {update}/{self._num_updates}"
+            print(f"{done} · return {return_text} · {rate_text} · {left_text}", flush=True)
+
+    def warn(self, text: str) -> None:
+        """Prints a line, above the bar if there is one."""
+        if self._bar:
+            self._bar.console.print(f"warning: {text}", markup=False, highlight=False)
+        elif self._is_shown:
+            print(f"warning: {text}", flush=True)
+
+    def _make_bar(self) -> Any:
+        from rich import console, progress  # noqa: PLC0415
+
+        screen = console.Console()
+        is_bare = screen.is_jupyter and importlib.util.find_spec("ipywidgets") is None  # a bar would warn, and not move
+        if is_bare or not (screen.is_terminal or screen.is_jupyter):
+            return None
+        columns = (
+            progress.TextColumn("update {task.completed}/{task.total}"),
+            progress.BarColumn(bar_width=None),
+            progress.TextColumn("{task.fields[evaluation]}", style="bold"),
+            progress.TextColumn("{task.fields[rate]}"),
+            progress.TextColumn("{task.fields[left]}"),
+        )
+        bar = progress.Progress(*columns, console=screen, refresh_per_second=4, expand=True)
+        fields: Any = {"rate": "compiling", "evaluation": "return -", "left": "-:-- left"}
+        self._task = bar.add_task("", total=self._num_updates, completed=self._update, **fields)
+        return bar
+
+
+def _short(number: float) -> str:
+    """Three digits and a unit: 41.2k."""
+    for scale, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= scale:
+            return f"{number / scale:.3g}{unit}"
+    return f"{number:.3g}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"

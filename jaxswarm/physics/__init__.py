@@ -1,0 +1,1 @@
+"""How bodies move, collide and find each other: the physics below the tasks."""

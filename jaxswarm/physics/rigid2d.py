@@ -1,0 +1,280 @@
+"""Discs that push boxes about in a walled square: one pure step of rigid bodies in the plane.
+
+The world of Gebhardt et al. (2018): discs are driven, boxes are only pushed, everything slides to rest. Bodies have
+momentum; contacts are solved for velocities, by accumulated impulses:
+
+* contacts are speculative: a pair may close its gap within a substep, not more;
+* the rows of one kind of contact are solved at once (projected Jacobi), kinds one after the other (Gauss-Seidel). Each
+  body's inverse mass is counted once per contact that it has in the kind ("mass splitting"; Tonge et al., 2012), so
+  that the result is stable and conserves momentum whatever touches what;
+* impulses start from those of the substep before.
+
+The moved states have these fields, in meters, radians and seconds, in a square centered at the origin:
+
+    position      [agents, 2]   of the discs
+    heading       [agents]      counter-clockwise from x
+    box_position  [boxes, 2]
+    box_heading   [boxes]
+    box_velocity  [boxes, 3]    x, y, turn rate
+    box_present   [boxes] bool  absent boxes stay where they are, and nothing touches them
+
+Write `Solver(...)` for other settings than those of `PRESETS`.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxswarm.physics.collisions import find_contacts, hold_discs, no_impulses
+from jaxswarm.physics.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver
+from jaxswarm.types import pytree
+
+# Boxes that are pressed together overlap by up to 0.2 mm in the first, and by some millimeters in the second.
+PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5)}
+
+BLOCK = 64  # worlds; measured, see benchmarks/LOG.md
+
+
+def move(solver: Solver, side: Float[Array, ""] | float, state: Any, command: Float[Array, "agents 2"]) -> Any:
+    """The state one step later; `command` holds the speed (m/s) and turn rate (rad/s) of each disc's motor.
+
+    Free discs reach 0.92 of both. A disc that is held up does not turn any slower. k discs that push a box squarely
+    drive it at 0.92 k m v / (k m + 0.08 M). Headings of discs end in [-pi, pi], where float32 is finest.
+    """
+    return _simulate(_Program(solver, solver.substeps, has_inertia=True), side, state, command)
+
+
+def settle(solver: Solver, side: Float[Array, ""] | float, state: Any, substeps: int = 40) -> Any:
+    """The state with overlaps pushed apart, and at rest; without overlaps nothing moves.
+
+    Forty substeps part any random placement of a few bodies, to within 0.1 mm.
+    """
+    program = _Program(solver, substeps, has_inertia=False)
+    state = _simulate(program, side, state, jnp.zeros_like(state.position))
+    return state.replace(box_velocity=jnp.zeros_like(state.box_velocity))
+
+
+class _Program(NamedTuple):
+    """What is compiled; boxes without inertia stop after each substep."""
+
+    solver: Solver
+    num_substeps: int
+    has_inertia: bool
+
+
+def _simulate(program: _Program, side: Array | float, state: Any, command: Array) -> Any:
+    names = ("position", "heading", "box_position", "box_heading", "box_velocity")
+    dtype = state.position.dtype
+    arrays = [jnp.asarray(side, dtype), command, state.box_present.astype(dtype)]
+    moved = _compiled(program, *arrays, *(getattr(state, name) for name in names))
+    return state.replace(**dict(zip(names, moved, strict=True)))
+
+
+@partial(jax.jit, static_argnames="program", inline=True)
+def _compiled(program: _Program, *arrays: Array) -> tuple[Array, ...]:
+    """Once for each program, so that steps outside of any `jit` are fast, too."""
+    return _worlds_last(program)(*arrays)
+
+
+def _worlds_last(program: _Program) -> Callable:
+    """`_run` that under `vmap` is called once, with all worlds in the last axis, rather than mapped inside.
+
+    A world's few bodies then lie side by side with those of all others, which made the solver three times as fast on
+    CPU. Derivatives take `_run` as it is, because JAX cannot transpose what has a batching rule of its own.
+    """
+    plain = partial(_run, program, False)
+    batched = jax.custom_batching.custom_vmap(
+        lambda *arrays: jax.lax.platform_dependent(*arrays, cpu=partial(_run, program, True), default=plain)
+    )
+
+    @batched.def_vmap
+    def many(num_envs: int, is_batched: list, *arrays: Array) -> tuple:
+        def last(x: Array, has_worlds: bool) -> Array:
+            return jnp.moveaxis(x, 0, -1) if has_worlds else jnp.broadcast_to(x[..., None], (*x.shape, num_envs))
+
+        arrays = tuple(map(last, arrays, is_batched))
+        result = jax.lax.platform_dependent(*arrays, cpu=partial(_run_blocks, program), default=plain)
+        return tuple(jnp.moveaxis(x, -1, 0) for x in result), (True,) * len(result)
+
+    differentiable = jax.custom_jvp(batched)
+    differentiable.defjvp(lambda primals, tangents: jax.jvp(plain, primals, tangents))
+    return differentiable
+
+
+def _run_blocks(program: _Program, *arrays: Array) -> tuple[Array, ...]:
+    """`_run` for `BLOCK` worlds at a time, which the cache of a CPU can hold."""
+    run = partial(_run, program, True)
+    num_envs = arrays[0].shape[-1]
+    if num_envs <= BLOCK:
+        return run(*arrays)
+    fill = -num_envs % BLOCK
+
+    def split(x: Array) -> Array:
+        x = jnp.concatenate([x, x[..., :fill]], -1)
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, BLOCK), -2, 0)
+
+    result = jax.lax.map(lambda block: run(*block), jax.tree.map(split, arrays))
+    joined = (jnp.moveaxis(x, 0, -2) for x in result)
+    return tuple(x.reshape(*x.shape[:-2], -1)[..., :num_envs] for x in joined)
+
+
+# What follows takes any number of worlds as last axes: [..., *worlds].
+
+
+@pytree
+class _Bodies:
+    """Everything that a substep changes."""
+
+    disc: Pose
+    box: Motion  # places and headings
+    velocity: Motion  # of the boxes
+    impulses: dict[str, Array]  # of each kind of contact
+
+
+def _run(
+    program: _Program,
+    is_apart: bool,
+    side: Float[Array, "*envs"],
+    command: Float[Array, "discs 2 *envs"],
+    present: Float[Array, "boxes *envs"],
+    position: Float[Array, "discs 2 *envs"],
+    heading: Float[Array, "discs *envs"],
+    box_position: Float[Array, "boxes 2 *envs"],
+    box_heading: Float[Array, "boxes *envs"],
+    box_velocity: Float[Array, "boxes 3 *envs"],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The last five arguments at the end; if stages are to be compiled apart, see `_apart`."""
+    solver, num_substeps, has_inertia = program
+    stage = _apart if is_apart else _together
+    speed, rate = DRAG * command[:, 0], DRAG * command[:, 1]
+    turn = solver.duration * rate
+    aim = heading + (turn - TICK * rate) / 2  # the mean heading of the ticks in a substep
+    turn_cos, turn_sin = jnp.cos(turn), jnp.sin(turn)
+
+    def substep(index: Array | int, bodies: _Bodies) -> _Bodies:
+        cos, sin = bodies.disc.cos, bodies.disc.sin
+        drive = Motion(speed * cos, speed * sin)
+        bodies = _substep(solver, partial(stage, index), has_inertia, side, present, drive, bodies)
+        turned = {"cos": cos * turn_cos - sin * turn_sin, "sin": sin * turn_cos + cos * turn_sin}
+        return dataclasses.replace(bodies, disc=dataclasses.replace(bodies.disc, **turned))
+
+    disc = Pose(position[:, 0], position[:, 1], jnp.cos(aim), jnp.sin(aim))
+    box = Motion(box_position[:, 0], box_position[:, 1], box_heading)
+    velocity = Motion(box_velocity[:, 0], box_velocity[:, 1], box_velocity[:, 2])
+    bodies = _Bodies(disc, box, velocity, no_impulses(disc.x, box.x))
+    bodies = jax.lax.fori_loop(0, num_substeps, substep, bodies)
+    disc, box, velocity = bodies.disc, bodies.box, bodies.velocity
+    return (
+        jnp.stack([disc.x, disc.y], 1),
+        _wrap(heading + num_substeps * turn),
+        jnp.stack([box.x, box.y], 1),
+        box.turn,
+        jnp.stack([velocity.x, velocity.y, velocity.turn], 1),
+    )
+
+
+def _wrap(angle: Array) -> Array:
+    """The angle in [-pi, pi]; a full turn is taken off in two parts, so that nothing is rounded."""
+    num_turns = jnp.round(angle / (2 * math.pi))
+    return (angle - 6.28125 * num_turns) - (2 * math.pi - 6.28125) * num_turns
+
+
+def _substep(
+    solver: Solver, stage: Callable, has_inertia: bool, side: Array, present: Array, drive: Motion, bodies: _Bodies
+) -> _Bodies:
+    """Contacts where bodies are; velocities that keep them apart; then everything moves."""
+    box = Pose(bodies.box.x, bodies.box.y, jnp.cos(bodies.box.turn), jnp.sin(bodies.box.turn))
+    contacts = find_contacts(solver, side, bodies.disc, box, present, stage)
+    counts = stage(lambda: {kind: contact.counts() for kind, contact in contacts.items()})
+    masses = stage(lambda: {kind: contact.masses(solver, counts[kind]) for kind, contact in contacts.items()})
+    contacts = {kind: contact.weighted(*masses[kind]) for kind, contact in contacts.items()}
+    inertia = solver.drag * present if has_inertia else 0 * present
+    motions = {"disc": drive, "box": jax.tree.map(lambda v: inertia * v, bodies.velocity)}
+    motions, impulses = stage(partial(_warm_start, solver), contacts, motions, bodies.impulses)
+    hold = partial(hold_discs, solver, side, bodies.disc)
+    motions, impulses = _solve(solver, stage, contacts, hold, motions, impulses)
+    shift = stage(partial(_part_boxes, solver), contacts, bodies.box)
+
+    def advance(place: Array, velocity: Array) -> Array:
+        return place + solver.duration * velocity
+
+    x, y = advance(bodies.disc.x, motions["disc"].x), advance(bodies.disc.y, motions["disc"].y)
+    moved = jax.tree.map(lambda a, v, s: advance(a, v) + s, bodies.box, motions["box"], shift)
+    return _Bodies(dataclasses.replace(bodies.disc, x=x, y=y), moved, motions["box"], impulses)
+
+
+def _warm_start(
+    solver: Solver, contacts: dict[str, Contact], motions: Motions, impulses: dict[str, Array]
+) -> tuple[Motions, dict[str, Array]]:
+    """Begins with the impulses of the substep before, where there still is contact."""
+    impulses = {kind: impulses[kind] * contact.normal.near for kind, contact in contacts.items()}
+    for kind, contact in contacts.items():
+        motions = contact.push(solver, motions, impulses[kind])
+    return motions, impulses
+
+
+def _solve(
+    solver: Solver,
+    stage: Callable,
+    contacts: dict[str, Contact],
+    hold: Callable[[Motion], Motion],
+    motions: Motions,
+    impulses: dict[str, Array],
+) -> tuple[Motions, dict[str, Array]]:
+    """Sweeps over all kinds of contact, from those that give way least to those that give way most.
+
+    Discs have another turn, and walls hold them after each: piles of discs are slowest to come apart.
+    """
+
+    def sweep(index: Array | int, carry: tuple) -> tuple:
+        motions, before = carry
+        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
+        after = dict(before)
+        for kind in (*contacts, "disc_disc"):
+            contact, last = contacts[kind], after[kind]
+            moved = {body: motions[body] for body in contact.bodies}
+            after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
+            motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
+            if kind == "disc_disc":
+                motions = motions | {"disc": hold(motions["disc"])}
+        return motions, after
+
+    slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
+    start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
+    motions, impulses = jax.lax.fori_loop(0, solver.iterations, sweep, (motions, start))
+    return motions, {kind: impulse for kind, (impulse, _) in impulses.items()}
+
+
+def _correct(solver: Solver, contact: Contact, motions: Motions, after: tuple, before: tuple) -> Motions:
+    """The motions, now that these are the impulses and no longer those."""
+    return contact.push(solver, motions, *jax.tree.map(jnp.subtract, after, before))
+
+
+def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Motion:
+    """Displacements of boxes that take back a share of their overlaps, and that no velocity will remember."""
+    shift = {"box": jax.tree.map(jnp.zeros_like, box)}
+    for kind in ("box_box", "box_wall"):
+        contact = contacts[kind]
+        overlap = jnp.maximum(-contact.gap, 0)
+        shift = contact.push(solver, shift, solver.box_recovery * overlap * contact.normal.mass)
+    return shift["box"]
+
+
+def _together(_: Array | int, function: Callable, *args: Any) -> Any:
+    return function(*args)
+
+
+def _apart(index: Array | int, function: Callable, *args: Any) -> Any:
+    """`function(*args)`, compiled by itself; `index` is that of a loop.
+
+    XLA on a CPU fuses all it can, and then computes what functions share again for each of their results, which took
+    five times as long. A conditional that it cannot foresee keeps it from that. On a GPU conditionals are dear.
+    """
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, *args))
+    return jax.lax.cond(index >= 0, function, lambda *_: nothing, *args)

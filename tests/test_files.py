@@ -1,0 +1,56 @@
+"""Rows of metrics.csv survive anything that may happen to the file."""
+
+import math
+
+import pytest
+
+from jaxswarm import files
+
+
+def make_row(update, **metrics):
+    start = {"update": update, "agent_steps": update * 10, "wall_seconds": update / 8, "seed": 3}
+    return start | {"train/x": math.nan, "eval/return_std": 1.5, "eval/return": -100.0 / (update + 1)} | metrics
+
+
+@pytest.fixture
+def path(tmp_path):
+    for update in (0, 5, 10):
+        files.append_row(tmp_path / "metrics.csv", make_row(update))
+    return tmp_path / "metrics.csv"
+
+
+def test_rows_come_back_in_single_precision_with_the_leading_columns_first(path):
+    assert (
+        path.read_text().splitlines()[0] == "update,agent_steps,wall_seconds,seed,eval/return,eval/return_std,train/x"
+    )
+    rows = files.read_rows(path)
+    assert [row["update"] for row in rows] == [0, 5, 10]
+    assert np.float32(rows[1]["eval/return"]) == np.float32(-100 / 6)
+    assert math.isnan(rows[0]["train/x"])
+    assert path.read_text().splitlines()[1].endswith(",")
+
+
+def test_a_torn_last_line_is_no_row(path):
+    for torn in ("15,150", "15,150,1.0,3,-4.0,1.5,2.0", "15,1\n"):
+        path.write_text(path.read_text() + torn)
+        assert [row["update"] for row in files.read_rows(path)] == [0, 5, 10]
+        assert len(files.keep_rows_before(path, 100)) == 3
+
+
+def test_rows_from_an_update_on_are_removed_and_written_again_the_same(path):
+    before = path.read_text()
+    path.write_text(before + "15,15")
+    assert [row["update"] for row in files.keep_rows_before(path, 10)] == [0, 5]
+    files.append_row(path, make_row(10))
+    assert path.read_text() == before
+
+
+def test_removing_all_rows_removes_the_columns_too(path):
+    assert files.keep_rows_before(path, 0) == []
+    files.append_row(path, {"update": 0, "eval/return": 1.0})
+    assert path.read_text() == "update,eval/return\n0,1.0\n"
+
+
+def test_no_file_has_no_rows(tmp_path):
+    assert files.read_rows(tmp_path / "none.csv") == []
+    assert files.keep_rows_before(tmp_path / "none.csv", 5) == []
