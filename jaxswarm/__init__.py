@@ -47,5 +47,5 @@ def make(name: str, **fields: Any) -> Any:
     from jaxswarm.tasks import TASKS  # noqa: PLC0415
 
     if name not in TASKS:
-        raise ValueError(f"task = {name!r} is not possible; accepted: {', '.join(TASKS)}")
+        raise ValueError(f"task: must be one of {', '.join(TASKS)}, got {name!r}")
     return TASKS[name](**fields)

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
+from jaxswarm import checks
 from jaxswarm.aggregators import Mean, sets
+from jaxswarm.checks import require
 from jaxswarm.distributions import Policy, gaussian
-from jaxswarm.types import Entities, Observation, is_bool, is_integer, require
+from jaxswarm.types import Entities, Observation
 
 
 def leaky_relu(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -92,8 +94,8 @@ class Tower(nn.Module):
         names = sorted(groups)
         if self.latent_space == "shared" and self.aggregator.num_encoders == 0 and len(names) > 1:
             raise ValueError(
-                f"latent_space = 'shared' is not possible for {', '.join(names)}: {type(self.aggregator).__name__} "
-                "takes the features of entities as they are; accepted: separate"
+                f"latent_space: must be separate for the groups {', '.join(names)}, got 'shared'; "
+                f"{type(self.aggregator).__name__} aggregates raw features, whose sizes differ between groups"
             )
         encoders = self._encoders(names)
         pools = {"groups": names} if self.latent_space == "shared" else {name: [name] for name in names}
@@ -159,14 +161,14 @@ class ActorCritic(nn.Module):
     __no_type_check__ = True  # checked below, with a message for users
 
     def __post_init__(self) -> None:
-        require(self, "aggregators, like Mean()", lambda x: isinstance(x, nn.Module), "aggregator")
-        require(self, "tuples of whole numbers from 1", _is_widths, "encoder", "shared_encoder", "decoder")
-        require(self, "at least one layer, like [64]", lambda x: len(x) > 0, "encoder")
-        require(self, ", ".join(ACTIVATIONS), lambda x: x in ACTIVATIONS, "activation")
-        require(self, "separate, shared", lambda x: x in ("separate", "shared"), "latent_space")
-        require(self, "shared, state", lambda x: x in ("shared", "state"), "std")
-        require(self, "True, False", is_bool, "linear_output_layers")
-        require(self, "whole numbers from 1", is_integer(1), "action_dim")
+        require(self, checks.Check("an aggregator, like Mean()", lambda x: isinstance(x, nn.Module)), "aggregator")
+        require(self, checks.Check("a tuple of integers >= 1", _is_widths), "encoder", "shared_encoder", "decoder")
+        require(self, checks.Check("a list of at least one layer, like [64]", lambda x: len(x) > 0), "encoder")
+        require(self, checks.choice(ACTIVATIONS), "activation")
+        require(self, checks.choice(("separate", "shared")), "latent_space")
+        require(self, checks.choice(("shared", "state")), "std")
+        require(self, checks.BOOL, "linear_output_layers")
+        require(self, checks.integer(1), "action_dim")
         if hasattr(self.aggregator, "check_width"):
             self.aggregator.check_width((*self.encoder, *self.shared_encoder)[-1])
         super().__post_init__()
@@ -208,7 +210,7 @@ class ActorCritic(nn.Module):
 
 
 def _is_widths(value: Any) -> bool:
-    return isinstance(value, tuple) and all(map(is_integer(1), value))
+    return isinstance(value, tuple) and all(map(checks.integer(1).accepts, value))
 
 
 def map_log_std(function: Callable[[Array], Array], params: Any) -> Any:

@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxswarm import rollout
+from jaxswarm import checks, rollout
+from jaxswarm.checks import require
 from jaxswarm.learners.on_policy import LearnerState, OnPolicy, batch_size
 from jaxswarm.networks import ActorCritic
 from jaxswarm.rollout import Environments, PolicyFn
-from jaxswarm.types import Key, Metrics, is_bool, is_integer, pytree, require, static
+from jaxswarm.types import Key, Metrics, pytree, static
 
 MAX_SAMPLES = 2**31 - 1  # of one update: int32 numbers them
 
@@ -44,21 +45,18 @@ class Experiment:
 
     def __post_init__(self) -> None:
         for name, does in {"task": "reset", "network": "apply", "learner": "update"}.items():
-            require(self, f"objects with `{does}`", lambda x, does=does: _has(x, does), name)
+            require(self, checks.Check(f"an object with `{does}`", lambda x, does=does: _has(x, does)), name)
         sizes = ("num_envs", "num_steps", "num_eval_envs", "eval_every")
-        require(self, "whole numbers from 1", is_integer(1), *sizes)
-        require(self, "null, whole numbers from 1", lambda x: x is None or is_integer(1)(x), "reset_pool")
-        require(self, "True, False", is_bool, "desynchronized_start")
+        require(self, checks.integer(1), *sizes)
+        require(self, checks.optional(checks.integer(1)), "reset_pool")
+        require(self, checks.BOOL, "desynchronized_start")
         if self.agent_steps_per_update > MAX_SAMPLES:
             raise ValueError(
-                f"num_envs * num_steps * num_agents = {self.agent_steps_per_update} is not possible; "
-                f"accepted: up to {MAX_SAMPLES}"
+                f"num_envs * num_steps * num_agents: must be at most {MAX_SAMPLES}, got {self.agent_steps_per_update}"
             )
         task, network = type(self.task).__name__, self.network
         if isinstance(network, ActorCritic) and network.action_dim != self.task.action_dim:
-            raise ValueError(
-                f"action_dim = {network.action_dim} is not possible in {task}; accepted: {self.task.action_dim}"
-            )
+            raise ValueError(f"action_dim: must be {self.task.action_dim} for {task}, got {network.action_dim}")
         if isinstance(self.learner, OnPolicy):
             batch_size(self.learner, self.agent_steps_per_update, self.task.num_agents)  # raises if it cannot be
 

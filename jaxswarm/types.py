@@ -1,11 +1,9 @@
 """The few data types that every floor shares."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Key = jax.Array  # a typed PRNG key
@@ -47,32 +45,6 @@ def pytree(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
-
-
-def require(owner: Any, accepted: str, is_accepted: Callable[[Any], bool], *names: str) -> None:
-    """Raises a `ValueError` that names the first wrong field; arrays, of JAX or NumPy, and tracers are not judged."""
-    for name in names:
-        value = getattr(owner, name)
-        is_array = isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.ndim > 0)
-        if not is_array and not _holds(is_accepted, value):
-            raise ValueError(f"{name} = {value!r} is not possible; accepted: {accepted}")
-
-
-def _holds(is_accepted: Callable[[Any], bool], value: Any) -> bool:
-    try:
-        return bool(is_accepted(value))
-    except TypeError:  # not a number at all
-        return False
-
-
-def is_integer(least: int) -> Callable[[Any], bool]:
-    """Accepts integers from `least`."""
-    return lambda value: isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
-
-
-def is_bool(value: Any) -> bool:
-    """Accepts truth values, and nothing that stands for one."""
-    return isinstance(value, bool | np.bool_)
 
 
 @pytree

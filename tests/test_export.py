@@ -94,8 +94,8 @@ def test_a_policy_is_exported_for_more_agents(run_dir, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("overrides", "part"),
     [
-        (["checkpoint=first"], "accepted: best, last"),
-        (["train_seed=3"], "train_seed = 3"),
+        (["checkpoint=first"], "must be one of best, last"),
+        (["train_seed=3"], "train_seed: must be one of the trained seeds"),
         (["num_envs=3"], "num_envs cannot be changed here"),
         (["task.dynamics=velocity"], "observations of other sizes"),
         (["nowhere"], "give one run folder, not 2"),

@@ -452,7 +452,7 @@ def test_wrong_words_are_errors(capsys):
         experiments.load("fig_9_9")
     for overrides, message in [
         (["fig_9_9"], "is no figure"),
-        (["fig_6_15", "scale=2"], "numbers above 0"),
+        (["fig_6_15", "scale=2"], "a number above 0"),
         (["fig_6_15", "seeds=0"], "integers from 1"),
         (["fig_6_15", "series=mu*"], "'μ only', 'μ+σ²'"),
         (["fig_6_15", "num_seeds=2"], "write seeds=N"),

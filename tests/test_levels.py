@@ -11,7 +11,7 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 LEVELS = [
-    {"types", "scene", "files", "config.schema"},
+    {"types", "checks", "scene", "files", "config.schema"},
     {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "config.plugins", "export.program"},
     {"physics.dynamics", "physics.neighbors", "physics.collisions", "aggregators.monoids", "aggregators.attentive"},
     {"physics.rigid2d", "tasks.swarm", "tasks.evasion", "aggregators.features", "physics", "bridges.gymnax"},

@@ -199,7 +199,9 @@ def test_pooling_by_a_query_gets_what_agents_know_of_themselves():
 @pytest.mark.parametrize("name", [name for name, x in AGGREGATORS.items() if x().num_encoders == 0])
 def test_features_of_several_groups_cannot_be_aggregated_together(name):
     model = ActorCritic(aggregator=AGGREGATORS[name](), latent_space="shared")
-    with pytest.raises(ValueError, match="latent_space = 'shared' is not possible for evaders, neighbors: "):
+    with pytest.raises(
+        ValueError, match="latent_space: must be separate for the groups evaders, neighbors, got 'shared'"
+    ):
         jax.eval_shape(model.init, jax.random.key(0), pursuit_like())
     jax.eval_shape(model.init, jax.random.key(0), rendezvous_like())
 
@@ -229,16 +231,16 @@ def test_with_linear_output_layers_only_hidden_layers_bend(widths):
 @pytest.mark.parametrize(
     ("field", "value", "accepted"),
     [
-        ("encoder", (), "at least one layer"),
-        ("encoder", (8, 0), "tuples of whole numbers from 1"),
-        ("aggregator", "mean", "aggregators, like Mean()"),
-        ("aggregator", AGGREGATORS["mean"], "aggregators, like Mean()"),
-        ("linear_output_layers", "no", "True, False"),
-        ("action_dim", 0, "whole numbers from 1"),
+        ("encoder", (), "a list of at least one layer, like [64]"),
+        ("encoder", (8, 0), "a tuple of integers >= 1"),
+        ("aggregator", "mean", "an aggregator, like Mean()"),
+        ("aggregator", AGGREGATORS["mean"], "an aggregator, like Mean()"),
+        ("linear_output_layers", "no", "true or false"),
+        ("action_dim", 0, "an integer >= 1"),
     ],
 )
 def test_impossible_options_are_named(field, value, accepted):
-    with pytest.raises(ValueError, match=re.escape(f"{field} = {value!r} is not possible; accepted: {accepted}")):
+    with pytest.raises(ValueError, match=re.escape(f"{field}: must be {accepted}, got {value!r}")):
         ActorCritic(**{field: value})
 
 

@@ -175,7 +175,7 @@ def test_an_mp4_is_written_by_ffmpeg(tmp_path):
     ("name", "options", "part"),
     [
         ("a.jpg", {}, ".html, .png, .gif, .mp4"),
-        ("a.html", {"frames": 3}, "accepted: .png, .gif"),
+        ("a.html", {"frames": 3}, "frames: must be used with .png, .gif, got .html"),
         ("a.mp4", {}, "ffmpeg"),
     ],
 )
@@ -205,10 +205,10 @@ def test_runs_are_rendered_side_by_side(run_dir, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("overrides", "part"),
     [
-        (["out=a.jpg"], "accepted: names that end in .html"),
-        (["checkpoint=first"], "accepted: best, last"),
-        (["frames=0", "out=a.png"], "frames = 0"),
-        (["frames=3"], "frames is not possible for .html"),
+        (["out=a.jpg"], "out: must end in one of .html"),
+        (["checkpoint=first"], "must be one of best, last"),
+        (["frames=0", "out=a.png"], "frames: must be an integer >= 1, got"),
+        (["frames=3"], "frames: must be used with"),
         (["num_envs=3"], "num_envs cannot be changed here"),
         (["task.dynamics=velocity"], "observations of other sizes"),
         (["nowhere"], "nowhere is not a run folder"),

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
+from jaxswarm import checks
 from jaxswarm.aggregators import sets
 from jaxswarm.aggregators.sets import DenseView
-from jaxswarm.types import is_bool, is_integer, require
+from jaxswarm.checks import require
 
 
 class Attentive(nn.Module):
@@ -34,15 +35,15 @@ class Attentive(nn.Module):
     num_encoders: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_integer(1), "num_heads")
-        require(self, "mean, query", lambda x: x in ("mean", "query"), "pooling")
-        require(self, "True, False", is_bool, "residual")
+        require(self, checks.integer(1), "num_heads")
+        require(self, checks.choice(("mean", "query")), "pooling")
+        require(self, checks.BOOL, "residual")
         super().__post_init__()
 
     def check_width(self, width: int) -> None:
         """Raises a `ValueError` for messages that heads cannot share."""
         if width % self.num_heads:
-            raise ValueError(f"num_heads = {self.num_heads} is not possible; accepted: divisors of {width} features")
+            raise ValueError(f"num_heads: must divide the message width {width}, got {self.num_heads}")
 
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
 
@@ -87,7 +88,7 @@ class Attentive(nn.Module):
     ) -> Float[Array, "receivers slots"]:
         """The w_i of a learned query: q_0 . y_i but for what is the same for all i; `value_output` is W_v W_o."""
         if view.own is None:
-            raise ValueError("own = None is not possible with pooling = 'query'; accepted: features of the receivers")
+            raise ValueError("own: must be the features of the receivers with pooling='query', got None")
         x = view.messages
         query = nn.Dense(x.shape[-1], name="query")(view.own) / math.sqrt(x.shape[-1])
         score = jnp.einsum("re,rie->ri", query, x) if self.residual else jnp.zeros(view.mask.shape)

@@ -10,10 +10,11 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Int, Shaped
 
+from jaxswarm import checks
 from jaxswarm.aggregators import sets
 from jaxswarm.aggregators.monoids import Mean
 from jaxswarm.aggregators.sets import DenseView
-from jaxswarm.types import is_integer, require
+from jaxswarm.checks import require
 
 
 class Concat(nn.Module):
@@ -29,7 +30,7 @@ class Concat(nn.Module):
     num_encoders: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_integer(1), "max_entities")
+        require(self, checks.integer(1), "max_entities")
         super().__post_init__()
 
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
@@ -67,9 +68,9 @@ class Histogram(nn.Module):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_integer(1), "num_distances")
-        require(self, "whole numbers from 3", is_integer(3), "num_bearings")
-        require(self, "positive numbers", lambda x: x > 0, "max_distance")
+        require(self, checks.integer(1), "num_distances")
+        require(self, checks.integer(3), "num_bearings")
+        require(self, checks.POSITIVE, "max_distance")
         super().__post_init__()
 
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
@@ -111,8 +112,8 @@ class RadialBasis(nn.Module):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 2", is_integer(2), "num_distances", "num_bearings")
-        require(self, "positive numbers", lambda x: x > 0, "max_distance", "distance_width", "bearing_width")
+        require(self, checks.integer(2), "num_distances", "num_bearings")
+        require(self, checks.POSITIVE, "max_distance", "distance_width", "bearing_width")
         super().__post_init__()
 
     __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
@@ -134,7 +135,7 @@ class RadialBasis(nn.Module):
 def _distance_and_bearing(features: Float[Array, "n dim"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 2"]]:
     """An entity at distance 0, whose bearing may be given as [0, 0], is ahead."""
     if features.shape[1] < 3:
-        raise ValueError(f"{features.shape[1]} features are not possible; accepted: distance, cos and sin of bearing")
+        raise ValueError(f"features: must start with distance, cos and sin, got {features.shape[1]} features")
     distance, bearing = features[:, :1], features[:, 1:3]
     is_ahead = (bearing == 0).all(-1, keepdims=True)
     return distance, jnp.where(is_ahead, jnp.array([[1.0, 0.0]]), bearing)

@@ -10,9 +10,10 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 from numpy.polynomial import Chebyshev, Polynomial
 
+from jaxswarm import checks
 from jaxswarm.aggregators import sets
 from jaxswarm.aggregators.sets import DenseView
-from jaxswarm.types import is_bool, require
+from jaxswarm.checks import require
 
 # log(1 + t) / t on [0, 1], to 2e-7; `jnp.log1p` takes several times as long on CPU
 _LOG1P = Chebyshev.interpolate(lambda t: np.log1p(t) / t, 9, [0, 1]).convert(kind=Polynomial).coef
@@ -145,10 +146,10 @@ class Bayesian(nn.Module):
 
     def __post_init__(self) -> None:
         priors = ("feature", "scalar", "fixed", None)
-        require(self, "feature, scalar, fixed, None", lambda x: x in priors, "prior_mean", "prior_variance")
-        require(self, "softplus, exp", lambda x: x in PRECISION, "rectifier")
-        require(self, "shared, separate", lambda x: x in ("shared", "separate"), "variance_encoder")
-        require(self, "True, False", is_bool, "output_variance")
+        require(self, checks.choice(priors), "prior_mean", "prior_variance")
+        require(self, checks.choice(PRECISION), "rectifier")
+        require(self, checks.choice(("shared", "separate")), "variance_encoder")
+        require(self, checks.BOOL, "output_variance")
         super().__post_init__()
 
     @property

@@ -114,10 +114,10 @@ def check(picture: Picture) -> None:
     """A `ValueError` for a logarithmic axis that cannot show the values."""
     x, y = _x_values(picture), _y_values(picture)
     if "x" in picture.log and not (x > 0).any():
-        raise ValueError(f"log = {picture.log} is not possible: no {picture.x_name} is above zero")
+        raise ValueError(f"log: {picture.x_name} must have values above zero, got none")
     if "y" in picture.log and y.min() <= 0 <= y.max():
         between = f"{y.min():g} to {y.max():g}"
-        raise ValueError(f"log = {picture.log} is not possible: the values of {picture.y_name} go from {between}")
+        raise ValueError(f"log: values of {picture.y_name} must have one sign, got {between}")
 
 
 def _in_units(picture: Picture) -> Picture:
@@ -169,11 +169,11 @@ def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, s
         axes.plot(seed.x, seed.y, color=style["color"], alpha=0.4, linewidth=0.6, zorder=3)
     behind = {"color": style["color"], "alpha": band_alpha, "linewidth": 0, "zorder": 1}
     axes.fill_between(line.x, line.lower, line.upper, step="post" if is_step else None, **behind)
-    is_integer = (line.num_seeds == line.num_seeds.max(initial=0)) | is_step
-    if not is_integer.all():
+    is_shared_by_all = (line.num_seeds == line.num_seeds.max(initial=0)) | is_step
+    if not is_shared_by_all.all():
         axes.plot(line.x, line.y, alpha=0.45, **style)
     label = f"{series.label} ({series.note})" if series.label and series.note else series.label or series.note
-    axes.plot(line.x, np.where(is_integer, line.y, math.nan), label=label, **style)
+    axes.plot(line.x, np.where(is_shared_by_all, line.y, math.nan), label=label, **style)
     ticks = {"color": style["color"], "markersize": 10, "markeredgewidth": 1.8, "zorder": 5}
     axes.plot(series.censored, _heights(line, series.censored), "|", **ticks)
 

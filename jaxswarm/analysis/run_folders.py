@@ -19,7 +19,7 @@ from jaxswarm.config import ConfigError
 from jaxswarm.files import Row, read_rows
 
 # keys that change neither a world nor a policy: seed, length, checkpoints, and when to look
-NOT_COMPARED = {"eval_every", *(field.name for field in dataclasses.fields(configs.Run))} - {configs.INIT_FROM}
+NOT_COMPARED = {"eval_every", *(field.name for field in dataclasses.fields(configs.RunSettings))} - {configs.INIT_FROM}
 
 Fields = dict[str, Any]  # a config by dotted key, without those that are not compared
 
@@ -38,10 +38,10 @@ def find(paths: Sequence[Path]) -> list[Path]:
     found: dict[Path, Path] = {}
     for path in paths:
         if not path.is_dir():
-            raise ConfigError(f"{path} is not a folder; accepted: run folders, and folders that hold some")
+            raise ConfigError(f"{path} is not a folder: give run folders, or folders that contain run folders")
         here = list(_run_folders(path))
         if not here:
-            raise ConfigError(f"{path} holds no run folder; accepted: folders with config.yaml and metrics.csv in them")
+            raise ConfigError(f"{path} contains no run folder, that is a folder with config.yaml and metrics.csv")
         found |= {folder.resolve(): folder for folder in here}
     return list(found.values())
 

@@ -139,7 +139,7 @@ def _choose(series: Sequence[str], pattern: str) -> list[str]:
     """The series with such names."""
     chosen = fnmatch.filter(series, pattern)
     if not chosen:
-        raise ConfigError(f"series = {pattern} is in no name; accepted: patterns for {', '.join(map(repr, series))}")
+        raise ConfigError(f"series: must match one of {', '.join(map(repr, series))}, got {pattern!r}")
     return chosen
 
 
@@ -149,7 +149,7 @@ def _scale(text: str) -> float:
     except ValueError:
         scale = 0.0
     if not 0 < scale <= 1:
-        raise ConfigError(f"scale = {text} is not possible; accepted: numbers above 0, up to 1")
+        raise ConfigError(f"scale: must be a number above 0, up to 1, got {text!r}")
     return scale
 
 

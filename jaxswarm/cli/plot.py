@@ -1,7 +1,6 @@
 """The program `jaxswarm-plot`."""
 
 import dataclasses
-import difflib
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ from jaxswarm.analysis.curves import STATISTICS, Curve
 from jaxswarm.analysis.plots import Picture, Series
 from jaxswarm.analysis.run_folders import RunFolder
 from jaxswarm.cli.program import program, split, wants_help, whole
-from jaxswarm.config import ConfigError
+from jaxswarm.config import ConfigError, schema
 from jaxswarm.files import replace_text
 
 HELP = """\
@@ -68,22 +67,24 @@ class Options:
         for name, accepted in CHOICES.items():
             if getattr(self, name) not in accepted:
                 choices = ", ".join(filter(None, accepted))
-                raise ConfigError(f"{name} = {getattr(self, name)!r} is not possible; accepted: {choices}")
+                raise ConfigError(f"{name}: must be one of {choices}, got {getattr(self, name)!r}")
         whole("smooth", self.smooth, 1)
         if self.kind == "threshold" and not _is_number(self.threshold):
-            raise ConfigError(f"threshold = {self.threshold!r} is not possible; accepted: a number, like threshold=-30")
+            raise ConfigError(f"threshold: must be a number, like threshold=-30, got {self.threshold!r}")
         if self.threshold and self.kind != "threshold":
-            raise ConfigError(f"threshold = {self.threshold} has no meaning here; accepted with kind=threshold")
+            raise ConfigError(f"threshold: must be used with kind=threshold, got kind={self.kind}")
         if self.statistic != Options.statistic and self.kind != "curve":
-            raise ConfigError(f"statistic = {self.statistic} has no meaning here; accepted with kind=curve")
+            raise ConfigError(f"statistic: must be used with kind=curve, got kind={self.kind}")
         if self.seeds == "true" and self.kind != "curve":
-            raise ConfigError("seeds = true has no meaning here; accepted with kind=curve")
+            raise ConfigError(f"seeds: must be used with kind=curve, got kind={self.kind}")
         if self.reference and (self.kind, self.x) != ("curve", "agent_steps"):
-            raise ConfigError("reference has no meaning here; accepted with kind=curve and x=agent_steps")
+            raise ConfigError(
+                f"reference: must be used with kind=curve and x=agent_steps, got {self.kind} and {self.x}"
+            )
         if self.series and not self.reference:
-            raise ConfigError("series has no meaning here; accepted with reference=FILE.csv")
+            raise ConfigError("series: must be used with reference=FILE.csv")
         if self.log and self.kind != "curve" and (self.log, self.kind) != ("x", "threshold"):
-            raise ConfigError(f"log = {self.log} is not possible with kind={self.kind}; accepted with kind=curve")
+            raise ConfigError(f"log: must be used with kind=curve, got kind={self.kind}")
 
 
 @program
@@ -117,8 +118,8 @@ def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
     for word in overrides:
         name, equals, _ = word.partition("=")
         if equals and not Path(word).exists():
-            near = "".join(f"did you mean {x!r}? " for x in difflib.get_close_matches(name, names, n=1))
-            raise ConfigError(f"unknown key {name!r}; {near}accepted: {', '.join(names)}")
+            near = schema.nearest(name, names)
+            raise ConfigError(f"unknown key {name!r}{near}; valid keys: {', '.join(names)}")
     if not overrides:
         raise ConfigError("give a run folder, or a folder that holds some: jaxswarm-plot PATH... [key=value ...]")
     return Options(**options), [Path(word) for word in overrides]
@@ -129,9 +130,9 @@ def _output(out: str) -> Path:
     path = Path(out or "plot.png")
     table = path.with_suffix(".csv")
     if path.suffix[1:].lower() not in plots.FORMATS:
-        raise ConfigError(f"out = {out!r} is not possible; accepted: {', '.join(f'FILE.{x}' for x in plots.FORMATS)}")
+        raise ConfigError(f"out: must be one of {', '.join(f'FILE.{x}' for x in plots.FORMATS)}, got {out!r}")
     if path.is_dir() or table.is_dir():
-        raise ConfigError(f"out = {out!r} is not possible: there is a folder of that name")
+        raise ConfigError(f"out: must be a file, got the folder {out!r}")
     is_ours = table.exists() and table.read_bytes().startswith(",".join(plots.COLUMNS).encode())
     if table.exists() and not is_ours:
         raise ConfigError(f"out = {path} would replace {table}, which is no table of this program; choose another name")
@@ -150,7 +151,9 @@ def _references(path: Path, options: Options) -> list[Series]:
         raise ConfigError(f"cannot read reference={path}: {error}") from error
     chosen = {name: line for name, line in lines.items() if options.series.lower() in name.lower()}
     if not chosen:
-        raise ConfigError(f"series = {options.series!r} is not in {path}; accepted: parts of {', '.join(lines)}")
+        raise ConfigError(
+            f"series: must be part of one of the names in {path} ({', '.join(lines)}), got {options.series!r}"
+        )
     sources = {name: f"{path.stem}, {line.num_seeds[0]} runs" for name, line in chosen.items() if line.num_seeds[0]}
     return [Series(name, line, sources.get(name, path.stem), is_reference=True) for name, line in chosen.items()]
 
@@ -163,8 +166,8 @@ def _groups(folders: Sequence[RunFolder], options: Options) -> dict[str, list[Ru
     for key in ("x", "y"):
         name = getattr(options, key)
         if name not in columns:
-            near = "".join(f"did you mean {x!r}? " for x in difflib.get_close_matches(name, columns, n=1))
-            raise ConfigError(f"{key} = {name!r} does not exist; {near}accepted: {', '.join(columns)}")
+            near = schema.nearest(name, columns)
+            raise ConfigError(f"{key}: must be one of {', '.join(columns)}, got {name!r}{near}")
     return runs.group(folders)
 
 

@@ -15,7 +15,7 @@ def which_checkpoint(options: Mapping[str, str]) -> Any:
     """What the option `checkpoint` asks for, `best` by default."""
     which = options.get("checkpoint", "best")
     if which not in ("best", "last"):
-        raise ConfigError(f"checkpoint = {which!r} is not possible; accepted: best, last")
+        raise ConfigError(f"checkpoint: must be one of best, last, got {which!r}")
     return which
 
 
@@ -26,7 +26,7 @@ def which_seeds(options: Mapping[str, str], config: Config) -> list[int]:
         return list(trained)
     seed = whole("train_seed", options["train_seed"], 0)
     if seed not in trained:
-        raise ConfigError(f"train_seed = {seed} is not possible; accepted: {trained[0]} to {trained[-1]}")
+        raise ConfigError(f"train_seed: must be one of the trained seeds {trained[0]} to {trained[-1]}, got {seed}")
     return [seed]
 
 

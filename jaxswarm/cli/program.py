@@ -89,7 +89,7 @@ def only(
     for key, _ in pairs:
         if not is_accepted(key):
             near = schema.nearest(key, list(options))
-            raise ConfigError(f"{key} cannot be changed here; {near}accepted: {accepted}")
+            raise ConfigError(f"{key} cannot be changed here{near}; valid here: {accepted}")
 
 
 def only_of_task(pairs: Sequence[tuple[str, Any]], config: Config, options: Sequence[str]) -> None:
@@ -107,7 +107,7 @@ def whole(name: str, value: Any, least: int) -> int:
     except ValueError:
         number = least - 1
     if not least <= number < 2**32:
-        raise ConfigError(f"{name} = {value} is not possible; accepted: integers from {least}")
+        raise ConfigError(f"{name}: must be an integer >= {least}, got {value!r}")
     return number
 
 

@@ -78,7 +78,8 @@ def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
         per_update = configs.build(config).agent_steps_per_update
         before, after = (configs.run_settings(x).length(per_update) for x in (config, extended))
         if after < before:
-            raise ConfigError(f"{pairs[0][0]} = {pairs[0][1]} is {after} updates; accepted: {before} updates or more")
+            key, value = pairs[0]
+            raise ConfigError(f"{key}: must be at least {before} updates, got {value} ({after} updates)")
     return _fit(extended, run_dir, is_resumed=True, is_first=is_first)
 
 

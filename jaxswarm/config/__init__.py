@@ -10,6 +10,7 @@ import dataclasses
 import inspect
 import itertools
 import math
+import re
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -34,7 +35,7 @@ LENGTHS = ("num_updates", "total_agent_steps")  # two ways to say the same
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class RunSettings:
     """What a config says beyond the experiment; of `num_updates` and `total_agent_steps`, one is given."""
 
     seed: int = 0
@@ -55,9 +56,9 @@ class Run:
             name, value = field.name, getattr(self, field.name)
             bound = 0 if name in ("seed", "checkpoint_seconds") else 1
             if isinstance(value, int | float) and value < bound:
-                raise ConfigError(f"{name} = {value!r} is not possible; accepted: numbers from {bound}")
+                raise ConfigError(f"{name}: must be a number >= {bound}, got {value!r}")
         if self.seed + self.num_seeds > 2**32:
-            raise ConfigError(f"seed = {self.seed} is not possible; accepted: numbers below 2**32")
+            raise ConfigError(f"seed: seed + num_seeds must be at most 2**32, got {self.seed} + {self.num_seeds}")
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -170,7 +171,7 @@ def parse(overrides: Sequence[str]) -> list[tuple[str, Any]]:
     """Keys and values of `key=value` words."""
     several = [word for word in overrides if len(combinations([word])) > 1]
     if several:
-        raise ConfigError(f"cannot read {several[0]!r}; accepted: key=value with one value, lists as key=[1,2]")
+        raise ConfigError(f"cannot read {several[0]!r}: write key=value with one value, and lists as key=[1,2]")
     return combinations(overrides)[0]
 
 
@@ -185,10 +186,10 @@ def combinations(overrides: Sequence[str]) -> list[list[tuple[str, Any]]]:
         try:
             parsed = parser.parse_override(word)
         except HydraException as error:
-            raise ConfigError(f"cannot read {word!r}; accepted: key=value, lists as key=[1,2]") from error
+            raise ConfigError(f"cannot read {word!r}: write key=value, and lists as key=[1,2]") from error
         is_range = parsed.is_sweep_override() and not parsed.is_choice_sweep()
         if parsed.type is not OverrideType.CHANGE or parsed.package or is_range:
-            raise ConfigError(f"cannot read {word!r}; accepted: key=value, lists as key=[1,2]")
+            raise ConfigError(f"cannot read {word!r}: write key=value, and lists as key=[1,2]")
         values = parsed.sweep_iterator() if parsed.is_choice_sweep() else [parsed.value()]
         choices.append([(parsed.key_or_group, value) for value in values])
     return [list(pairs) for pairs in itertools.product(*choices)]
@@ -205,7 +206,7 @@ def override(config: Config, pairs: Iterable[tuple[str, Any]]) -> Config:
         head, _, tail = full_key(key, config).partition(".")
         if not tail:
             if isinstance(config.get(key), dict):
-                raise ConfigError(f"{key} = {value!r} is not possible; accepted: {key}.<field>=value")
+                raise ConfigError(f"{key}: set single fields with {key}.<field>=value, got {value!r}")
             config[key] = value
         elif isinstance(config.get(head), dict):
             config[head][tail] = value
@@ -221,7 +222,7 @@ def full_key(key: str, config: Config) -> str:
     owners = [part for part in PARTS if key in _fields(part, config[part])]
     if len(owners) > 1:
         choice = " or ".join(f"{part}.{key}" for part in owners)
-        raise ConfigError(f"{key} is a field of {' and '.join(owners)}; accepted: {choice}")
+        raise ConfigError(f"{key} is a field of {' and '.join(owners)}: write {choice}")
     return f"{owners[0]}.{key}" if owners else key
 
 
@@ -294,7 +295,7 @@ def _registered_name(part: str, cls: type) -> str:
     for name, registered in _registries()[part].items():
         if registered is cls:
             return name
-    raise ConfigError(f"{cls.__name__} is not registered; accepted: {', '.join(_registries()[part])}")
+    raise ConfigError(f"{part}: must be a registered class ({', '.join(_registries()[part])}), got {cls.__name__}")
 
 
 def _plain(owner: Any, names: Iterable[str]) -> dict[str, Any]:
@@ -309,7 +310,8 @@ def build_part(part: str, config: Config) -> Any:
     try:
         return _registries()[part][fields.pop("name")](**fields)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{part}: {error}") from error
+        is_field = re.match(r"\w+: must ", str(error))
+        raise ConfigError(f"{part}{'.' if is_field else ': '}{error}") from error
 
 
 def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
@@ -317,9 +319,9 @@ def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
 
 
-def run_settings(config: Config) -> Run:
+def run_settings(config: Config) -> RunSettings:
     """What the config says beyond the experiment."""
-    return Run(**_tuples({field.name: config[field.name] for field in dataclasses.fields(Run)}))
+    return RunSettings(**_tuples({field.name: config[field.name] for field in dataclasses.fields(RunSettings)}))
 
 
 def _registries() -> dict[str, dict[str, Any]]:
@@ -352,7 +354,7 @@ def _experiment_fields() -> dict[str, inspect.Parameter]:
 
 
 def _top_fields() -> dict[str, inspect.Parameter]:
-    return schema.parameters(Run) | _experiment_fields()
+    return schema.parameters(RunSettings) | _experiment_fields()
 
 
 def _check_fields(values: dict, fields: dict[str, inspect.Parameter], part: str, config: Config) -> dict:
@@ -375,7 +377,9 @@ def _unknown(key: str, prefix: str, config: Config) -> ConfigError:
     every = [*itertools.chain(*fields.values()), *top]
     same_leaf = [name for name in every if name.rpartition(".")[2] == key.rpartition(".")[2]]
     accepted = fields[prefix] if prefix else [*top, *(f"{part}.<field>" for part in PARTS)]
-    return ConfigError(f"unknown key {key!r}; {schema.nearest(key, same_leaf or every)}accepted: {', '.join(accepted)}")
+    return ConfigError(
+        f"unknown key {key!r}{schema.nearest(key, same_leaf or every)}; valid keys: {', '.join(accepted)}"
+    )
 
 
 def _choice(group: str, value: Any, accepted: list[str]) -> str:
@@ -386,4 +390,4 @@ def _choice(group: str, value: Any, accepted: list[str]) -> str:
 
 def _unknown_choice(group: str, value: Any, accepted: list[str]) -> ConfigError:
     near = schema.nearest(str(value), accepted)
-    return ConfigError(f"{group} = {value!r} does not exist; {near}accepted: {', '.join(accepted)}")
+    return ConfigError(f"{group}: must be one of {', '.join(accepted)}, got {value!r}{near}")

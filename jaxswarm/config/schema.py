@@ -41,7 +41,7 @@ def check(value: Any, annotation: Any, name: str) -> Any:
             if element is not int or min(elements, default=1) >= 1:  # integers in lists are sizes
                 return elements
     hint = f" (write {int(value)})" if isinstance(value, float) and value.is_integer() else ""
-    raise ConfigError(f"{name} = {value!r} is not possible; accepted: {_describe(annotation)}{hint}")
+    raise ConfigError(f"{name}: must be {_describe(annotation)}, got {value!r}{hint}")
 
 
 def _members(annotation: Any) -> tuple:
@@ -50,23 +50,23 @@ def _members(annotation: Any) -> tuple:
 
 
 def _describe(annotation: Any) -> str:
-    overrides = {bool: "true, false", int: "an integer, like 8", float: "a number, like 1e-3", str: "text"}
+    names = {bool: "true or false", int: "an integer, like 8", float: "a number, like 1e-3", str: "text"}
     described = []
     for accepted in _members(annotation):
         if typing.get_origin(accepted) is typing.Literal:
-            described += [str(x) for x in typing.get_args(accepted)]
+            described.append(f"one of {', '.join(map(str, typing.get_args(accepted)))}")
         elif typing.get_origin(accepted) is tuple:
             element = typing.get_args(accepted)[0]
             named = f"a list of {_describe(element)}"
-            described.append("a list of integers from 1, like [120,60]" if element is int else named)
+            described.append("a list of integers >= 1, like [120,60]" if element is int else named)
         elif accepted is types.NoneType:
             described.append("null")
-        elif accepted in overrides:
-            described.append(overrides[accepted])
-    return ", ".join(described)
+        elif accepted in names:
+            described.append(names[accepted])
+    return " or ".join(described)
 
 
 def nearest(word: str, accepted: list[str]) -> str:
-    """A question about a word that may be meant, ending in a space; empty if none is near."""
+    """Suggestion of the most similar word, to be appended to a message; empty if no word is similar."""
     near = difflib.get_close_matches(word, accepted, n=1, cutoff=0.5 if "." not in word else 0.3)
-    return f"did you mean {near[0]!r}? " if near else ""
+    return f" (did you mean {near[0]!r}?)" if near else ""

@@ -77,7 +77,7 @@ def names() -> list[str]:
 def load(name: str) -> Figure:
     """The figure of this name; a `ConfigError` lists those that there are."""
     if name not in names():
-        raise ConfigError(f"{name} is no figure; accepted: all, {', '.join(names())}")
+        raise ConfigError(f"figure: must be one of all, {', '.join(names())}, got {name!r}")
     fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
     overrides, reference = fields.pop("overrides").split(), fields.pop("reference", None)
     thesis = fields.pop("thesis", None) or {series: series for series in fields["series"]}

@@ -65,7 +65,7 @@ def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> RunBatch:
     leaves = [jax.tree.leaves(experiment) for experiment in experiments]
     structures = {jax.tree.structure(experiment) for experiment in experiments}
     if len(structures) > 1:
-        raise ValueError("experiments differ in what fixes a program's shapes; accepted: such as differ in numbers")
+        raise ValueError("experiments of one program must differ in numeric (traced) hyperparameters only")
     stacked = [np.repeat(_stack(x), num_seeds, axis=0) for x in zip(*leaves, strict=True)]
     batch = jax.tree.unflatten(structures.pop(), stacked)
     return RunBatch(batch, make_mesh(len(experiments) * num_seeds, experiments[0].num_envs))
@@ -83,8 +83,8 @@ def make_mesh(num_runs: int, num_envs: int) -> Mesh | None:
     runs, envs = mesh_shape(num_runs, num_envs, num_devices)
     if jax.process_count() > 1 and runs * envs < num_devices:
         raise ValueError(
-            f"{num_runs} runs of {num_envs} worlds cannot be spread over {num_devices} devices; "
-            "accepted: numbers of runs or worlds that they divide"
+            f"{num_runs} runs with {num_envs} environments cannot be spread over {num_devices} devices; "
+            "the number of devices must divide the number of runs or of environments"
         )
     if runs * envs == 1:
         return None

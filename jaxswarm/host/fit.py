@@ -98,7 +98,7 @@ def fit(
         "checkpoint_seconds": checkpoint_seconds,
         "keep_checkpoints": keep_checkpoints,
     }
-    seeds = configs.Run(**given).seeds
+    seeds = configs.RunSettings(**given).seeds
     if config is None and run_dir is not None:
         config = configs.describe(experiment, **given, loggers=log_to)
         if config is None:
@@ -137,7 +137,9 @@ def fit_runs(
             loggers.load(name)
     begun, new = started_and_new([run.run_dir for run in runs if run.run_dir])
     if begun and new:
-        raise FileExistsError(f"{begun[0]} holds a run and {new[0]} none; accepted: runs that have all begun, or none")
+        raise FileExistsError(
+            f"{begun[0]} holds a run and {new[0]} does not; runs of one program are all new or all resumed"
+        )
     with contextlib.ExitStack() as locks:
         for run in runs:
             if run.run_dir and jax.process_index() == 0:
@@ -191,8 +193,8 @@ def _check_params(run: Run) -> None:
     needed = abstract_state(run.experiment).learner.params
     if jax.tree.map(np.shape, run.init_params) != jax.tree.map(lambda x: x.shape[1:], needed):
         raise ConfigError(
-            "the policy to begin with has parameters of other shapes; accepted: one of the same network, "
-            "trained with as many features and actions"
+            "init_params: must have the parameter shapes of this network; "
+            "train the warm start with the same network, observation features and actions"
         )
 
 

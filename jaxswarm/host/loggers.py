@@ -103,7 +103,7 @@ LOGGERS: dict[str, Callable[[str | Path, Mapping[str, Any] | None, int], Logger]
 def load(name: str) -> ModuleType:
     """The package that a logger needs; a `ConfigError` says how to get it, or which loggers there are."""
     if name not in PACKAGES:
-        raise ConfigError(f"loggers = {name!r} is not possible; accepted: a list of {', '.join(PACKAGES)}")
+        raise ConfigError(f"loggers: must be a list of {', '.join(PACKAGES)}, got {name!r}")
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError as error:

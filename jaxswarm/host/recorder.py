@@ -95,13 +95,13 @@ def check_folder(run: Run, resume: bool) -> None:
     if rows and not (run.run_dir / "checkpoints").exists():
         raise FileExistsError(
             f"{run.run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "
-            "accepted: a folder with both, or another one to train it again"
+            "choose another folder to train it again"
         )
     seeds = sorted({int(row["seed"]) for row in rows})
     changed = _changes(run) if set(seeds) <= set(run.seeds) else {"seeds": (seeds, list(run.seeds))}
     if changed:
         name, (before, now) = next(iter(changed.items()))
-        raise FileExistsError(f"{run.run_dir} holds a run with {name} = {before}, not {now}; accepted: the same run")
+        raise FileExistsError(f"{run.run_dir} holds another run: {name} is {before} there, and {now} here")
 
 
 def _changes(run: Run) -> dict[str, tuple]:

@@ -44,7 +44,7 @@ def load(
     return policies.experiment, jax.tree.map(lambda x: x[0], policies.params)
 
 
-def warm_start(settings: configs.Run, run_dir: Path) -> Any:
+def warm_start(settings: configs.RunSettings, run_dir: Path) -> Any:
     """The parameters that `init_from` asks for; `None` without it, or where the run folder has a checkpoint.
 
     Errors are those of `load`.
@@ -52,7 +52,7 @@ def warm_start(settings: configs.Run, run_dir: Path) -> Any:
     if settings.init_from is None or has_checkpoint(run_dir):
         return None
     if not (Path(settings.init_from) / "config.yaml").is_file():
-        raise ConfigError(f"init_from = {settings.init_from} is not possible; accepted: a run folder")
+        raise ConfigError(f"init_from: must be a run folder, got {settings.init_from!r}")
     return load(settings.init_from)[1]
 
 
@@ -67,7 +67,7 @@ def read(
     experiment, trained = configs.build(config), configs.run_settings(config).seeds
     missing = [seed for seed in seeds if seed not in trained]
     if missing:
-        raise ConfigError(f"seed = {missing[0]} is not possible; accepted: {trained[0]} to {trained[-1]}")
+        raise ConfigError(f"seed: must be one of the trained seeds {trained[0]} to {trained[-1]}, got {missing[0]}")
     template = {"learner": {"params": abstract_state(experiment, len(trained)).learner.params}}
     restored = restore(run_dir / "checkpoints", template, which, warn)
     if restored is None:

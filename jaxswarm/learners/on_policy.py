@@ -15,8 +15,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.rollout import Trajectory, spread_rows
-from jaxswarm.types import Key, Metrics, Observation, is_bool, is_integer, pytree, require, static
+from jaxswarm.types import Key, Metrics, Observation, pytree, static
 
 Params = Any
 Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
@@ -51,13 +53,13 @@ class OnPolicy:
 def check(learner: OnPolicy) -> None:
     """A `ValueError` names the first of these hyper-parameters that is not possible."""
     positive = ("learning_rate", "max_grad_norm", "adam_epsilon")
-    require(learner, "positive finite numbers", lambda x: 0 < x < math.inf, *positive)
-    require(learner, "numbers from 0 to 1", lambda x: 0 <= x <= 1, "discount", "gae_lambda")
-    require(learner, "numbers from 0", lambda x: x >= 0, "value_coefficient", "entropy_coefficient")
-    require(learner, "whole numbers from 1", is_integer(1), "num_epochs")
-    require(learner, "null, whole numbers from 2", lambda x: x is None or is_integer(2)(x), "batch_size")
-    require(learner, "True, False", is_bool, "bootstrap_truncation")
-    require(learner, "agents, envs", lambda x: x in ("agents", "envs"), "sampling_unit")
+    require(learner, checks.POSITIVE_FINITE, *positive)
+    require(learner, checks.UNIT_INTERVAL, "discount", "gae_lambda")
+    require(learner, checks.NOT_NEGATIVE, "value_coefficient", "entropy_coefficient")
+    require(learner, checks.integer(1), "num_epochs")
+    require(learner, checks.optional(checks.integer(2)), "batch_size")
+    require(learner, checks.BOOL, "bootstrap_truncation")
+    require(learner, checks.choice(("agents", "envs")), "sampling_unit")
 
 
 def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
@@ -68,8 +70,8 @@ def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
         return nearest[0]
     unit = _unit(learner, num_agents)
     raise ValueError(
-        f"batch_size = {asked} is not possible; accepted: divisors of num_envs * num_steps * num_agents = "
-        f"{num_samples} that are multiples of {unit}, for instance {', '.join(map(str, sorted(nearest[:4]))) or 'none'}"
+        f"batch_size: must divide num_envs * num_steps * num_agents = {num_samples} and be a multiple of {unit}, "
+        f"for example {', '.join(map(str, sorted(nearest[:4]))) or 'none'}, got {asked}"
     )
 
 

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.learners import on_policy
 from jaxswarm.learners.on_policy import LearnerState, Minibatch, OnPolicy, Params
 from jaxswarm.rollout import Trajectory
-from jaxswarm.types import Key, Metrics, pytree, require
+from jaxswarm.types import Key, Metrics, pytree
 
 
 @pytree
@@ -21,7 +23,7 @@ class PPO(OnPolicy):
 
     def __post_init__(self) -> None:
         on_policy.check(self)
-        require(self, "positive numbers", lambda x: x > 0, "clip_range")
+        require(self, checks.POSITIVE, "clip_range")
 
     def init(self, params: Params) -> LearnerState:
         """State before the first update."""

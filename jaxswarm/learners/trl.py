@@ -8,13 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.distributions import gaussian_with_std
 from jaxswarm.learners import on_policy
 from jaxswarm.learners.on_policy import LearnerState, Mask, Minibatch, OnPolicy, Params
 from jaxswarm.learners.projections import ENTROPY_SCHEDULES, PROJECTIONS, Projection, control_entropy, entropy
 from jaxswarm.networks import map_log_std
 from jaxswarm.rollout import Trajectory
-from jaxswarm.types import Key, Metrics, pytree, require, static
+from jaxswarm.types import Key, Metrics, pytree, static
 
 
 @pytree
@@ -58,25 +60,24 @@ class TRL(OnPolicy):
         on_policy.check(self)
         require(
             self,
-            "positive numbers",
-            lambda x: x > 0,
+            checks.POSITIVE,
             "mean_bound",
             "cov_bound",
             "regression_coefficient",
             "entropy_updates",
         )
-        require(self, "numbers between 0 and 1", lambda x: 0 < x < 1, "entropy_temperature")
+        require(self, checks.Check("a number above 0 and below 1", lambda x: 0 < x < 1), "entropy_temperature")
         for name, accepted in {
             "projection": tuple(PROJECTIONS),
             "objective": ("projected", "raw"),
             "entropy_control": ("none", "inequality", "equality"),
             "entropy_schedule": tuple(ENTROPY_SCHEDULES),
         }.items():
-            require(self, ", ".join(accepted), accepted.__contains__, name)
+            require(self, checks.choice(accepted), name)
         if self.objective == "raw" and self.entropy_control != "none":
             raise ValueError(
-                f"entropy_control = {self.entropy_control!r} is not possible with objective = 'raw', whose policy is "
-                "never projected; accepted: none"
+                "entropy_control: must be none with objective='raw', whose policy is never projected, "
+                f"got {self.entropy_control!r}"
             )
 
     @property

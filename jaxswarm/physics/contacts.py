@@ -20,7 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxswarm.types import is_integer, pytree, require, static
+from jaxswarm import checks
+from jaxswarm.checks import require
+from jaxswarm.types import pytree, static
 
 DURATION = 1.0  # s, of one step
 DISC_RADIUS = 0.0165  # m
@@ -64,11 +66,11 @@ class Solver:
     offsets: Offsets = BOX2D_OFFSETS
 
     def __post_init__(self) -> None:
-        require(self, "whole numbers from 1", is_integer(1), "substeps", "iterations")
-        require(self, "numbers above 0 and below 2", lambda x: 0 < x < 2, "relaxation")
-        require(self, "numbers above 0, up to 1", lambda x: 0 < x <= 1, "recovery", "box_recovery")
-        require(self, "positive numbers", lambda x: x > 0, "max_speed")
-        require(self, "numbers from 0", lambda x: x >= 0, "box_friction", "wall_friction")
+        require(self, checks.integer(1), "substeps", "iterations")
+        require(self, checks.Check("a number above 0 and below 2", lambda x: 0 < x < 2), "relaxation")
+        require(self, checks.Check("a number above 0, up to 1", lambda x: 0 < x <= 1), "recovery", "box_recovery")
+        require(self, checks.POSITIVE, "max_speed")
+        require(self, checks.NOT_NEGATIVE, "box_friction", "wall_friction")
 
     @property
     def duration(self) -> float:

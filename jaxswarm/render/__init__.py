@@ -47,11 +47,11 @@ def check(path: Path, **options: int) -> None:
     """Raises a `RenderError` for what `write` could not do, before any time is spent on films."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise RenderError(f"out = {path} is not possible; accepted: names that end in {', '.join(FORMATS)}")
+        raise RenderError(f"out: must end in one of {', '.join(FORMATS)}, got {str(path)!r}")
     for name in options:
         if name not in OPTIONS[suffix]:
             accepted = ", ".join(suffix for suffix, names in OPTIONS.items() if name in names)
-            raise RenderError(f"{name} is not possible for {suffix}; accepted: {accepted}")
+            raise RenderError(f"{name}: must be used with {accepted}, got {suffix}")
     if suffix == ".mp4":
         pictures.find_ffmpeg()
 

@@ -85,7 +85,7 @@ def find_ffmpeg() -> str:
     """Where ffmpeg is; a `RenderError` where it is not."""
     ffmpeg = shutil.which("ffmpeg")
     if ffmpeg is None:
-        raise RenderError(".mp4 needs the program ffmpeg, which is not installed; accepted: .html, .gif, .png")
+        raise RenderError(".mp4 needs the program ffmpeg; install it, or write .html, .gif or .png")
     return ffmpeg
 
 

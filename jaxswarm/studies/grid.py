@@ -38,7 +38,7 @@ def trials(wanted: Sequence[Config], sweep_dir: Path) -> list[Trial]:
     if len(set(labels)) < len(labels):
         names = ", ".join(sorted(folders.NOT_COMPARED))
         accepted = "other values of other keys, and num_seeds=N for N seeds"
-        raise ConfigError(f"two runs of the sweep are the same but for {names}; accepted: {accepted}")
+        raise ConfigError(f"two runs of the sweep differ only in {names}; give {accepted}")
     return [
         Trial(config, experiment, sweep_dir / name)
         for config, experiment, name in zip(wanted, experiments, names, strict=True)
@@ -93,7 +93,7 @@ def _listed(word: str) -> str:
             raise ValueError
     except ValueError:
         accepted = "low..high:count or low..high:count log, with count from 2 and, for log, numbers above 0"
-        raise ConfigError(f"{word} is not possible; accepted: {key}={accepted}") from None
+        raise ConfigError(f"{key}: must be {accepted}, got {value!r}") from None
     numbers = np.geomspace(low, high, count) if found["log"] else np.linspace(low, high, count)
     is_integer = all(float(x).is_integer() for x in (low, high)) and all(abs(x - round(x)) < 1e-9 for x in numbers)
     texts = (str(round(x)) if is_integer and "." not in found["low"] + found["high"] else f"{x:.6g}" for x in numbers)

@@ -31,15 +31,13 @@ def load_space(name: str, config: Config) -> Space:
     shipped = {path.stem: path for path in (configs.config_dir() / configs.SEARCHES).glob("*.yaml")}
     path = shipped.get(name, Path(name))
     if not path.is_file():
-        raise ConfigError(f"search = {name} does not exist; accepted: {', '.join(sorted(shipped))}, or a YAML file")
+        raise ConfigError(f"search: must be one of {', '.join(sorted(shipped))}, or a YAML file, got {name!r}")
     content = configs.read(path)
     if unknown := set(content) - {"parameters", "aggregator"}:
-        raise ConfigError(f"{path} has a key {unknown.pop()!r}; accepted: parameters, aggregator")
+        raise ConfigError(f"{path}: keys must be parameters and aggregator, got {unknown.pop()!r}")
     parameters, of_aggregators = (content.get(part) or {} for part in ("parameters", "aggregator"))
     if not all(isinstance(x, dict) for x in (parameters, of_aggregators, *getattr(of_aggregators, "values", list)())):
-        raise ConfigError(
-            f"{path} is no search space; accepted: parameters: {{key: choice}}, aggregator: {{name: {{...}}}}"
-        )
+        raise ConfigError(f"{path}: must have the form parameters: {{key: choice}}, aggregator: {{name: {{...}}}}")
     space = parameters | of_aggregators.get(config["aggregator"]["name"], {})
     for key, choice in space.items():
         _check(key, choice)
@@ -152,7 +150,7 @@ def _check(key: str, choice: Any) -> None:
     """Raises a `ConfigError` for what is not a choice."""
     if not ((isinstance(choice, list) and choice) or _is_range(choice, {"log", "step", "layers", "last"})):
         accepted = "a list, or numbers low and high and if wanted log (from above 0), step, layers: [least, most], last"
-        raise ConfigError(f"{key}: {choice} is not possible in a search space; accepted: {accepted}")
+        raise ConfigError(f"{key}: must be {accepted}, got {choice}")
 
 
 def _is_range(choice: Any, more: set[str]) -> bool:

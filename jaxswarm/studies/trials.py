@@ -24,7 +24,7 @@ class Trial:
     run_dir: Path
 
     @property
-    def settings(self) -> configs.Run:
+    def settings(self) -> configs.RunSettings:
         """What the config says beyond the experiment."""
         return configs.run_settings(self.config)
 

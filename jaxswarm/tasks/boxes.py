@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.physics import rigid2d
 from jaxswarm.physics.contacts import BOX_SIDE
 from jaxswarm.physics.geometry import norm
 from jaxswarm.scene import Goals, Scene
 from jaxswarm.tasks.arena import Arena, State, View
-from jaxswarm.tasks.swarm import NumberRange, require_range
-from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_integer, pytree, require, static
+from jaxswarm.tasks.swarm import NumberRange
+from jaxswarm.types import Entities, Key, Metrics, Observation, Step, pytree, static
 
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # over the side; where clusters belong, in their order
 
@@ -35,11 +37,13 @@ def _now_and_finally(is_over: Bool[Array, ""], metrics: Metrics) -> Metrics:
 
 
 def _check(task: "Assembly | Clustering") -> None:
-    require(task, "whole numbers from 1", is_integer(1), "num_agents", "num_boxes", "episode_length")
-    at_least = f"sides of a square that a box fits in, from {2 * BOX_SIDE}"
-    require(task, at_least, lambda x: 2 * BOX_SIDE <= x < math.inf, "side")
-    require(task, ", ".join(rigid2d.PRESETS), lambda x: x in rigid2d.PRESETS, "physics")
-    require_range(task, "active_boxes", 1, task.num_boxes)
+    require(task, checks.integer(1), "num_agents", "num_boxes", "episode_length")
+    fits_a_box = checks.Check(
+        f"a finite number >= {2 * BOX_SIDE}, so that a box fits in", lambda x: 2 * BOX_SIDE <= x < math.inf
+    )
+    require(task, fits_a_box, "side")
+    require(task, checks.choice(rigid2d.PRESETS), "physics")
+    require(task, checks.optional(checks.integer_range(1, task.num_boxes)), "active_boxes")
 
 
 @pytree
@@ -130,10 +134,10 @@ class Clustering:
 
     def __post_init__(self) -> None:
         _check(self)
-        require(self, ", ".join(REWARDS), lambda x: x in REWARDS, "reward")
-        require(self, ", ".join(IDENTITIES), lambda x: x in IDENTITIES, "cluster_identity")
+        require(self, checks.choice(REWARDS), "reward")
+        require(self, checks.choice(IDENTITIES), "cluster_identity")
         most = min(self.num_boxes, len(CORNERS)) if self.reward == "corners" else self.num_boxes
-        require(self, f"whole numbers from 1 to {most}", lambda x: is_integer(1)(x) and x <= most, "num_clusters")
+        require(self, checks.integer(1, most), "num_clusters")
 
     @property
     def cluster(self) -> tuple[int, ...]:

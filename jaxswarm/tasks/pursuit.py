@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.physics.dynamics import Velocity
 from jaxswarm.physics.geometry import Space, bearing, direction, norm, unit_vector
 from jaxswarm.physics.neighbors import Neighborhood, neighborhood
@@ -15,7 +17,7 @@ from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.evasion import evader_direction
 from jaxswarm.tasks.swarm import NumberRange
-from jaxswarm.types import Entities, Key, Metrics, Observation, Step, is_integer, pytree, require, static
+from jaxswarm.types import Entities, Key, Metrics, Observation, Step, pytree, static
 
 EVADER_STRIDE = 2.0  # world units in one step, twice what a pursuer can do
 CATCH_DISTANCE = {"distance": 1.0, "catches": 2.0}  # world units
@@ -84,10 +86,10 @@ class Pursuit:
 
     def __post_init__(self) -> None:
         swarm.require_swarm(self, least=1)
-        require(self, "whole numbers from 1", is_integer(1), "num_evaders")
-        swarm.require_range(self, "active_evaders", 1, self.num_evaders)
-        require(self, "positive finite numbers", lambda x: 0 < x < math.inf, "evader_visibility_radius")
-        require(self, ", ".join(CATCH_DISTANCE), lambda x: x in CATCH_DISTANCE, "reward")
+        require(self, checks.integer(1), "num_evaders")
+        require(self, checks.optional(checks.integer_range(1, self.num_evaders)), "active_evaders")
+        require(self, checks.POSITIVE_FINITE, "evader_visibility_radius")
+        require(self, checks.choice(CATCH_DISTANCE), "reward")
 
     @property
     def space(self) -> Space:

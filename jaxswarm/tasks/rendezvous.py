@@ -7,13 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.physics.dynamics import DYNAMICS, Acceleration, Velocity
 from jaxswarm.physics.geometry import Space, direction
 from jaxswarm.physics.neighbors import Neighborhood, neighborhood
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.swarm import NumberRange, View
-from jaxswarm.types import Entities, Key, Observation, Step, pytree, require, static
+from jaxswarm.types import Entities, Key, Observation, Step, pytree, static
 
 RELATIVE_VELOCITY = {
     "normalized": lambda difference, max_speed: difference / (2 * max_speed),  # in [-1, 1]
@@ -67,8 +69,8 @@ class Rendezvous:
 
     def __post_init__(self) -> None:
         swarm.require_swarm(self, least=2)
-        require(self, ", ".join(DYNAMICS), lambda x: x in DYNAMICS, "dynamics")
-        require(self, ", ".join(RELATIVE_VELOCITY), lambda x: x in RELATIVE_VELOCITY, "relative_velocity")
+        require(self, checks.choice(DYNAMICS), "dynamics")
+        require(self, checks.choice(RELATIVE_VELOCITY), "relative_velocity")
 
     @property
     def space(self) -> Space:

@@ -1,15 +1,16 @@
 """What swarms of points have in common: how many take part, where they start, and who each of them looks at."""
 
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxswarm import checks
+from jaxswarm.checks import require
 from jaxswarm.physics.geometry import Plane, Space, Torus, bearing, norm, unit_vector
 from jaxswarm.physics.neighbors import Neighborhood
-from jaxswarm.types import Key, Metrics, is_bool, is_integer, pytree, require
+from jaxswarm.types import Key, Metrics, pytree
 
 NumberRange = tuple[int, int]  # lowest and highest
 
@@ -25,22 +26,12 @@ class View:
 
 def require_swarm(task: Any, least: int) -> None:
     """Checks the fields that tasks of point swarms share."""
-    require(task, f"whole numbers from {least}", is_integer(least), "num_agents")
-    require(task, "whole numbers from 1", is_integer(1), "episode_length")
-    require(task, "null, whole numbers from 1", lambda x: x is None or is_integer(1)(x), "max_neighbors")
-    require(task, "positive finite numbers", lambda x: 0 < x < math.inf, "side", "visibility_radius")
-    require(task, "True, False", is_bool, "torus")
-    require_range(task, "active_agents", least, task.num_agents)
-
-
-def require_range(task: Any, name: str, least: int, most: int) -> None:
-    """Checks a field that is a range of numbers of which one is drawn for each episode, or None."""
-
-    def is_accepted(value: Any) -> bool:
-        is_pair = isinstance(value, tuple) and len(value) == 2 and all(map(is_integer(least), value))
-        return value is None or (is_pair and value[0] <= value[1] <= most)
-
-    require(task, f"null, a pair (low, high) from {least} to {most}", is_accepted, name)
+    require(task, checks.integer(least), "num_agents")
+    require(task, checks.integer(1), "episode_length")
+    require(task, checks.optional(checks.integer(1)), "max_neighbors")
+    require(task, checks.POSITIVE_FINITE, "side", "visibility_radius")
+    require(task, checks.BOOL, "torus")
+    require(task, checks.optional(checks.integer_range(least, task.num_agents)), "active_agents")
 
 
 def space(task: Any) -> Space:

@@ -1,0 +1,73 @@
+"""Checks of the fields that users set: what a value must be, in words and as a predicate."""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+
+class Check(NamedTuple):
+    """A condition on a value: `description` completes the sentence "must be ..."."""
+
+    description: str
+    accepts: Callable[[Any], bool]
+
+
+def require(owner: Any, check: Check, *names: str) -> None:
+    """Raise a `ValueError` for the first field of `owner` that fails the check.
+
+    Arrays (JAX or NumPy) and tracers are not checked, because their values may be unknown.
+    """
+    for name in names:
+        value = getattr(owner, name)
+        is_array = isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.ndim > 0)
+        if not is_array and not _holds(check, value):
+            raise ValueError(f"{name}: must be {check.description}, got {value!r}")
+
+
+def _holds(check: Check, value: Any) -> bool:
+    try:
+        return bool(check.accepts(value))
+    except TypeError:  # not a number at all
+        return False
+
+
+def integer(least: int, most: int | None = None) -> Check:
+    """Accept integers from `least` to `most`; booleans are no integers."""
+
+    def accepts(value: Any) -> bool:
+        is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return is_integer and bool(least <= value) and (most is None or bool(value <= most))
+
+    return Check(f"an integer >= {least}" if most is None else f"an integer from {least} to {most}", accepts)
+
+
+def choice(names: Iterable[Any]) -> Check:
+    """Accept one of these names."""
+    names = tuple(names)
+    return Check(f"one of {', '.join('null' if x is None else str(x) for x in names)}", names.__contains__)
+
+
+def optional(check: Check) -> Check:
+    """Accept `None` and everything that the check accepts."""
+    return Check(f"null or {check.description}", lambda value: value is None or check.accepts(value))
+
+
+def integer_range(least: int, most: int) -> Check:
+    """Accept a pair of integers `(low, high)` with `least <= low <= high <= most`."""
+    accepts_one = integer(least, most).accepts
+
+    def accepts(value: Any) -> bool:
+        is_pair = isinstance(value, tuple) and len(value) == 2 and all(map(accepts_one, value))
+        return is_pair and value[0] <= value[1]
+
+    return Check(f"a pair [low, high] of integers from {least} to {most}", accepts)
+
+
+BOOL = Check("true or false", lambda value: isinstance(value, bool | np.bool_))
+POSITIVE = Check("a positive number", lambda value: value > 0)
+POSITIVE_FINITE = Check("a positive finite number", lambda value: 0 < value < math.inf)
+NOT_NEGATIVE = Check("a number >= 0", lambda value: value >= 0)
+UNIT_INTERVAL = Check("a number from 0 to 1", lambda value: 0 <= value <= 1)
