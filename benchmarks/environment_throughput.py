@@ -1,11 +1,14 @@
-"""Steps per second of swarms of points with random actions, observations included; prints one JSON object per line.
+"""Measure steps per second of the tasks without boxes, with random actions and including observations.
 
-    python benchmarks/environment_throughput.py [worlds=1,64] [agents=10,50] [tasks=pursuit] [repeats=3] [out=FILE]
+    python benchmarks/environment_throughput.py [tasks=pursuit] [num_envs=1,64] [num_agents=10] [repeats=3] [out=FILE]
 
-`environment_steps_per_second` are steps of single worlds, `agent_steps_per_second` those times the agents. Each step is
-followed by the observation of all agents, of which every number is used. Finished episodes restart from a few start
-states. For pursuit, with one and with five evaders, `evasion_over_observation` is the time of the evaders' rule over
-that of the observation of the same worlds. Boxes have a benchmark of their own, box_physics.py.
+The benchmark prints one JSON object per line, for each combination of task, `num_agents` and `num_envs`.
+`environment_steps_per_second` counts the steps of single environments. `agent_steps_per_second` multiplies this by the
+number of agents. After each step, all agents observe, and every number of the observations is used. Finished episodes
+restart from a few start states.
+
+For pursuit of one evader and of five evaders, `evasion_over_observation` is a ratio of times: the evaders' rule over
+the observation of the same environments. The tasks with boxes have their own benchmark, box_physics.py.
 """
 
 import itertools
@@ -24,12 +27,12 @@ TASK_FIELDS = {
     "pursuit": ("pursuit", {}),
     "pursuit_multi": ("pursuit", {"num_evaders": 5, "reward": "catches"}),
 }
-PAIRS_PER_RUN = 2e7  # bounds the time of one measurement
+PAIRS_PER_MEASUREMENT = 2e7  # pairs of agents; bounds the time of one measurement
 
 
 @partial(jax.jit, static_argnames=("num_envs", "num_steps"))
 def play(task, key, num_envs, num_steps):
-    """A number that depends on every step and observation."""
+    """Return the sum of all rewards and observations, so that XLA can drop no step and no observation."""
     start = jax.vmap(task.reset)(jax.random.split(key, num_envs))
 
     def step(carry, key):
@@ -48,6 +51,7 @@ def play(task, key, num_envs, num_steps):
 
 
 def evasion_over_observation(task, key, num_envs, repeats):
+    """Return the time of the evaders' rule over the time of the observation, both in `num_envs` environments."""
     states = jax.vmap(task.reset)(jax.random.split(key, num_envs))
 
     @jax.jit
@@ -60,15 +64,16 @@ def evasion_over_observation(task, key, num_envs, repeats):
         return jax.vmap(rule)(states)
 
     observe = jax.jit(jax.vmap(task.observe))
-    rounds = [[seconds(f, states, repeats=1) for f in (flee, observe)] for _ in range(10 * repeats)]  # side by side
+    rounds = [[seconds(f, states, repeats=1) for f in (flee, observe)] for _ in range(10 * repeats)]  # in turn
     times = [min(column) for column in zip(*rounds, strict=True)]
     return times[0] / times[1]
 
 
 def measure(name, num_envs, num_agents, repeats):
+    """Return the row of one task at one size."""
     task_name, fields = TASK_FIELDS[name]
     task, key = TASKS[task_name](num_agents=num_agents, **fields), jax.random.key(0)
-    num_steps = int(min(500, max(4, PAIRS_PER_RUN / num_envs / num_agents**2)))
+    num_steps = int(min(500, max(4, PAIRS_PER_MEASUREMENT / num_envs / num_agents**2)))
     duration = seconds(partial(play, task, key, num_envs, num_steps), repeats=repeats)
     rate = num_envs * num_steps / duration
     result = {
@@ -84,9 +89,10 @@ def measure(name, num_envs, num_agents, repeats):
 
 
 def main(overrides):
-    given = settings(overrides, tasks=",".join(TASK_FIELDS), worlds="1,64,1024,8192", agents="10,50,200", repeats="3")
-    worlds, agents = ([int(number) for number in given[name].split(",")] for name in ("worlds", "agents"))
-    for name, num_agents, num_envs in itertools.product(given["tasks"].split(","), agents, worlds):
+    defaults = {"num_envs": "1,64,1024,8192", "num_agents": "10,50,200", "repeats": "3"}
+    given = settings(overrides, tasks=",".join(TASK_FIELDS), **defaults)
+    envs, agents = ([int(number) for number in given[name].split(",")] for name in ("num_envs", "num_agents"))
+    for name, num_agents, num_envs in itertools.product(given["tasks"].split(","), agents, envs):
         report(measure(name, num_envs, num_agents, int(given["repeats"])), given["out"])
 
 

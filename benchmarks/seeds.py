@@ -1,11 +1,13 @@
-"""How long several seeds take side by side, over one seed, and how much memory; one JSON line for each number of seeds.
+"""Measure time and memory of training several seeds in one program, compared with one seed.
 
     python benchmarks/seeds.py [seeds=1,4,16,64] [width=N] [updates=3] [out=FILE] [group=choice | key=value] ...
 
-The other words describe the experiment as for jaxswarm-train. Every number of seeds has a process of its own, so that
-peak memory is its own, too; times are minima over the updates. `width` seeds are trained at a time, the rest after
-them; the default is that of training. The cores of a CPU are as many devices, unless XLA_FLAGS says how many:
-XLA_FLAGS=--xla_force_host_platform_device_count=1.
+The benchmark prints one JSON object per line, for each number of seeds. The other arguments are overrides of
+jaxswarm-train. Each number of seeds is measured in a process of its own, so its peak memory is its own, too. Times are
+minima over the updates.
+
+Each device trains `width` seeds at a time and the other seeds after them; the default is the width of jaxswarm-train.
+Every core of a CPU is a device. Set XLA_FLAGS=--xla_force_host_platform_device_count=1 for another number of devices.
 """
 
 import json
@@ -15,15 +17,15 @@ import time
 
 import jax
 import numpy as np
-from jaxswarm.cli.overrides import split, use_compile_cache
-from timing import peak_memory, report
+from timing import help_if_asked, peak_memory, report
 
 from jaxswarm import config
+from jaxswarm.cli.program import split, use_compile_cache
 from jaxswarm.host import ensemble
 
 
 def measure(num_seeds, num_updates, overrides):
-    """Seconds per update of all seeds, and of compiling."""
+    """Return the time per update of all seeds, the time of the first update (with compilation), and the memory."""
     experiment = config.build(config.compose(overrides))
     batch = ensemble.make_batch([experiment], num_seeds)
     states = ensemble.init_batch(batch, range(num_seeds))
@@ -32,7 +34,7 @@ def measure(num_seeds, num_updates, overrides):
     for update in range(num_updates + 1):
         states, _ = jax.block_until_ready(program(batch.experiments, states, np.int32(1)))
         now = time.perf_counter()
-        if update == 0:  # compiles, and evaluates
+        if update == 0:  # includes compilation and an evaluation
             first = now - start
         else:
             best = min(best, now - start)
@@ -48,6 +50,7 @@ def measure(num_seeds, num_updates, overrides):
 
 
 def main(overrides):
+    help_if_asked(overrides)
     options, overrides = split(overrides, ("seeds", "width", "updates", "out", "only"))
     num_updates = int(options.get("updates", 3))
     if "width" in options:
@@ -57,14 +60,14 @@ def main(overrides):
         ensemble.use_cores(int(options["only"]))
         print(json.dumps(measure(int(options["only"]), num_updates, overrides) | {"width": ensemble.CPU_WIDTH}))
         return
-    of_one = None
+    one_seed = None
     for num_seeds in options.get("seeds", "1,4,16,64").split(","):
         given = [f"{name}={options[name]}" for name in ("width", "updates") if name in options]
         command = [sys.executable, __file__, f"only={num_seeds}", *given, *overrides]
         output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        result = {"benchmark": "seeds", "words": overrides} | json.loads(output.splitlines()[-1])
-        of_one = of_one or result["seconds_per_update"] / result["num_seeds"]
-        result["over_one_seed"] = result["seconds_per_update"] / of_one
+        result = {"benchmark": "seeds", "overrides": overrides} | json.loads(output.splitlines()[-1])
+        one_seed = one_seed or result["seconds_per_update"] / result["num_seeds"]
+        result["over_one_seed"] = result["seconds_per_update"] / one_seed
         report(result, options.get("out", ""))
 
 

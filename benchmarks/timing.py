@@ -1,28 +1,43 @@
-"""What the benchmarks share: words in, lines of JSON out, times of calls, the speed of the machine, memory."""
+"""Shared parts of the benchmarks: help, overrides, JSON output, timing, machine speed and memory."""
 
 import json
 import resource
 import statistics
+import sys
 import time
+from collections.abc import Sequence
 
 import jax
 
 from jaxswarm.host import manifest
 
 
-def settings(overrides: list[str], **defaults: str) -> dict[str, str]:
-    """The values of `key=value` words over the defaults; a `ValueError` says which keys there are."""
-    for word in overrides:
-        key, equals, _ = word.partition("=")
-        if not equals or key not in (*defaults, "out"):
-            raise ValueError(
-                f"{word} is not possible; accepted: {', '.join(f'{key}=...' for key in (*defaults, 'out'))}"
-            )
-    return {"out": ""} | defaults | dict(word.split("=", 1) for word in overrides)
+def help_if_asked(arguments: Sequence[str]) -> None:
+    """Print the docstring of the benchmark and exit, if the user asks for help."""
+    if {"-h", "--help", "help"} & set(arguments):
+        print(sys.modules["__main__"].__doc__)
+        raise SystemExit(0)
+
+
+def settings(overrides: Sequence[str], **defaults: str) -> dict[str, str]:
+    """Return the defaults with the values of `key=value` overrides; print help and exit if the user asks for it.
+
+    Raises a `ValueError` that lists the keys if an override has no value or an unknown key.
+    """
+    help_if_asked(overrides)
+    keys = (*defaults, "out")
+    for override in overrides:
+        key, equals, _ = override.partition("=")
+        if not equals or key not in keys:
+            raise ValueError(f"overrides: must be key=value with one of the keys {', '.join(keys)}, got {override}")
+    return {"out": ""} | defaults | dict(override.split("=", 1) for override in overrides)
 
 
 def report(result: dict, out: str = "") -> None:
-    """Prints the result as a line of JSON, to four digits and with where it was measured, and appends it to a file."""
+    """Print the result as one line of JSON, and append it to the file `out` if one is given.
+
+    Numbers are rounded to four digits. The line also has the versions, the device and the revision of the code.
+    """
     rounded = json.loads(json.dumps(result), parse_float=lambda x: float(f"{float(x):.4g}"))
     line = json.dumps(rounded | manifest.provenance())
     print(line, flush=True)
@@ -32,7 +47,7 @@ def report(result: dict, out: str = "") -> None:
 
 
 def seconds(function, *args, repeats: int) -> float:
-    """Median time of a call, after one that does not count."""
+    """Return the median time of a call in seconds, after one call that is not timed."""
     jax.block_until_ready(function(*args))
     times = []
     for _ in range(repeats):
@@ -43,13 +58,13 @@ def seconds(function, *args, repeats: int) -> float:
 
 
 def peak_memory() -> float:
-    """MiB: of the device where it tells, else of this process."""
-    statistics_of_device = jax.local_devices()[0].memory_stats() or {}
-    in_bytes = statistics_of_device.get("peak_bytes_in_use", 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    """Return the peak memory in MiB, of the device if it reports memory, otherwise of this process."""
+    device_memory = jax.local_devices()[0].memory_stats() or {}
+    in_bytes = device_memory.get("peak_bytes_in_use", 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     return in_bytes / 2**20
 
 
 def gemm_flops() -> float:
-    """FLOP/s of a product of 2048 x 2048 matrices, float32."""
+    """Measure the FLOP/s of a product of two 2048 x 2048 matrices in float32."""
     matrix = jax.random.normal(jax.random.key(3), (2048, 2048))
     return 2 * 2048**3 / seconds(jax.jit(lambda x: x @ x), matrix, repeats=9)

@@ -1,14 +1,15 @@
-"""How fast a training setting compiles, steps and learns; prints one JSON object.
+"""Measure how fast a training setting compiles, steps and learns.
 
     python benchmarks/training_throughput.py [group=choice | key=value] ... [repeats=3] [threshold=X seeds=8] [out=FILE]
 
-takes the words of `jaxswarm-train`, for instance `experiment=rendezvous_thesis aggregator=bayesian`. `gemm_fraction` is
-the useful matrix-multiply FLOP/s of the update over those of a 2048 x 2048 float32 matrix product timed in the same
-process: recomputed activations and everything that is no matrix product count for nothing.
+The benchmark prints one JSON object. It takes the overrides of jaxswarm-train, for example
+`experiment=rendezvous_thesis aggregator=bayesian`. `gemm_fraction` is the ratio of two speeds in FLOP/s: the useful
+matrix products of the update, over a product of two 2048 x 2048 float32 matrices timed in the same process. Recomputed
+activations and operations other than matrix products do not count as useful.
 
-With a threshold it also trains several seeds side by side, as `jaxswarm-train` does, to the end of the setting:
-`seconds_to_threshold` are those after which the median seed had a return there, compiling included, of those seeds that
-reached it.
+With `threshold`, the benchmark also trains several seeds in one program to the end of the setting, as jaxswarm-train
+does. `seconds_to_threshold` is the median time to a return of at least the threshold, over the seeds that reached it.
+It includes compilation.
 """
 
 import multiprocessing
@@ -20,11 +21,11 @@ from functools import partial
 
 import jax
 import numpy as np
-from jaxswarm.cli.overrides import split
-from timing import gemm_flops, peak_memory, report, seconds
+from timing import gemm_flops, help_if_asked, peak_memory, report, seconds
 
 from jaxswarm import config, init, rollout, train
 from jaxswarm.analysis import curves
+from jaxswarm.cli.program import split
 from jaxswarm.files import RETURN
 from jaxswarm.host import ensemble
 from jaxswarm.host.fit import fit
@@ -32,9 +33,10 @@ from jaxswarm.training import Experiment, evaluate
 
 
 def useful_flops(experiment: Experiment, params: dict) -> int:
-    """Of the matrix products of one sample's forward and backward pass, each weight counted once per use.
+    """Return the FLOP of the matrix products in the forward and backward pass of one sample.
 
-    Forward, gradient of the weights, gradient of the inputs; the last is not needed for the observation itself.
+    Each weight counts once per use, in three products: forward, gradient of the weights, gradient of the inputs. The
+    last one is not needed in the first layer.
     """
     task = experiment.task
     groups = jax.eval_shape(lambda: task.observe(task.reset(jax.random.key(0)))).groups
@@ -52,11 +54,14 @@ def useful_flops(experiment: Experiment, params: dict) -> int:
 
 
 def time_to_return(overrides: list[str], threshold: float, num_seeds: int) -> dict[str, float]:
-    """Trains the seeds, in a process of its own: each core is a device there."""
+    """Train all seeds, and return how many reach the threshold, and when.
+
+    This function must run in a process of its own, because it makes each core a device.
+    """
     ensemble.use_cores(num_seeds)
-    settings = config.compose(overrides)
-    experiment = config.build(settings)
-    num_updates = config.run_settings(settings).length(experiment.agent_steps_per_update)
+    composed = config.compose(overrides)
+    experiment = config.build(composed)
+    num_updates = config.run_settings(composed).length(experiment.agent_steps_per_update)
     _, rows = fit(experiment, num_updates, num_seeds=num_seeds, progress=False)
     of_seeds = list(curves.from_rows(rows, "wall_seconds", RETURN)[0].values())
     times, is_reached = curves.times_to(of_seeds, threshold)
@@ -65,6 +70,7 @@ def time_to_return(overrides: list[str], threshold: float, num_seeds: int) -> di
 
 
 def main(overrides: list[str]) -> None:
+    help_if_asked(overrides)
     options, overrides = split(overrides, ("repeats", "threshold", "seeds", "out"))
     repeats = int(options.get("repeats", 3))
     experiment = config.build(config.compose(overrides))

@@ -1,4 +1,4 @@
-"""Checks of the fields that users set: what a value must be, in words and as a predicate."""
+"""Checks of user-defined fields: each check has a description for error messages and a predicate."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -9,14 +9,14 @@ import numpy as np
 
 
 class Check(NamedTuple):
-    """A condition on a value: `description` completes the sentence "must be ..."."""
+    """A condition on a value; `description` completes the sentence "must be ..."."""
 
     description: str
     accepts: Callable[[Any], bool]
 
 
 def require(owner: Any, check: Check, *names: str) -> None:
-    """Raise a `ValueError` for the first field of `owner` that fails the check.
+    """Raise a `ValueError` for the first field in `names` of `owner` that fails the check.
 
     Arrays (JAX or NumPy) and tracers are not checked, because their values may be unknown.
     """
@@ -30,12 +30,12 @@ def require(owner: Any, check: Check, *names: str) -> None:
 def _holds(check: Check, value: Any) -> bool:
     try:
         return bool(check.accepts(value))
-    except TypeError:  # not a number at all
+    except TypeError:  # the predicate compares numbers and the value is not a number
         return False
 
 
 def integer(least: int, most: int | None = None) -> Check:
-    """Accept integers from `least` to `most`; booleans are no integers."""
+    """Accept integers from `least` to `most`, both included; booleans are rejected."""
 
     def accepts(value: Any) -> bool:
         is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
@@ -45,13 +45,13 @@ def integer(least: int, most: int | None = None) -> Check:
 
 
 def choice(names: Iterable[Any]) -> Check:
-    """Accept one of these names."""
+    """Accept any of the given names; `None` among them is described as null."""
     names = tuple(names)
     return Check(f"one of {', '.join('null' if x is None else str(x) for x in names)}", names.__contains__)
 
 
 def optional(check: Check) -> Check:
-    """Accept `None` and everything that the check accepts."""
+    """Accept `None` and all values that `check` accepts."""
     return Check(f"null or {check.description}", lambda value: value is None or check.accepts(value))
 
 

@@ -1,4 +1,4 @@
-"""Files that are written completely or not at all, and the rows of `metrics.csv`."""
+"""Atomic writing of files, and reading and writing of `metrics.csv`."""
 
 import csv
 import io
@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 
 RETURN = "eval/return"
-Row = dict[str, Any]  # a line of metrics.csv; empty cells are NaN
+Row = dict[str, Any]  # row of metrics.csv by column; empty cells are NaN
 
 INTEGERS = ("update", "agent_steps", "seed")
 LEADING = ("update", "agent_steps", "wall_seconds", "seed", "eval/return", "eval/return_std")
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Writes a file as a whole: after a crash it has its old content or the new."""
+    """Write a text file atomically: after a crash it has either its old content or the new one."""
     replace_bytes(path, text.encode())
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
-    """`replace_text` for what is no text."""
+    """Write a binary file atomically, as `replace_text` does."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with open(temporary, "wb") as file:
         file.write(content)
@@ -33,7 +33,10 @@ def replace_bytes(path: Path, content: bytes) -> None:
 
 
 def append_row(path: Path, row: Row) -> None:
-    """Appends a line that is on disk when this returns; the first row of a file fixes its columns."""
+    """Append a row to a CSV file and flush it to disk.
+
+    The first row of a file determines its columns. Missing values are NaN, which is an empty cell.
+    """
     is_new = not path.exists() or path.stat().st_size == 0
     columns = _columns(row) if is_new else _header(path)
     buffer = io.StringIO()
@@ -48,7 +51,7 @@ def append_row(path: Path, row: Row) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """All complete rows; a last line that was cut off is left out."""
+    """Read all complete rows. A truncated last line is skipped; a missing file has no rows."""
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8")
@@ -60,7 +63,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def keep_rows_before(path: Path, update: int) -> list[Row]:
-    """Removes rows from `update` on, and any torn line; what remains is returned."""
+    """Remove the rows from `update` on and truncated lines; return the remaining rows."""
     rows = [row for row in read_rows(path) if row["update"] < update]
     if path.exists():
         write_rows(path, rows)
@@ -68,7 +71,7 @@ def keep_rows_before(path: Path, update: int) -> list[Row]:
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Replaces the file; all rows have the same columns, and without any the file is empty."""
+    """Replace the file by these rows, which must have the same columns. Without rows the file is empty."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerows([list(rows[0]), *([_cell(x) for x in row.values()] for row in rows)] if rows else [])
@@ -85,7 +88,7 @@ def _header(path: Path) -> list[str]:
 
 
 def _cell(value: Any) -> str:
-    """Shortest text that reads back to the same number; metrics are single precision."""
+    """Return the shortest text that gives the same number in single precision, the precision of metrics."""
     if isinstance(value, int):
         return str(value)
     return "" if math.isnan(value) else str(np.float32(value))

@@ -1,7 +1,8 @@
-"""What one picture contains, in world units and roles; NumPy only.
+"""Scenes: what a viewer draws for one state of a task, in world units. This module imports only NumPy.
 
-A task describes its states as scenes, and viewers draw scenes: neither knows the other. Scenes are named tuples, which
-JAX takes for pytrees without being imported here; a film is one scene whose arrays have the frames as first axis.
+Tasks convert states to scenes and viewers draw scenes, so that tasks and viewers do not depend on each other. Scenes
+are named tuples, which JAX treats as pytrees without an import here. A film stores one scene whose arrays have a
+leading axis of frames.
 """
 
 import math
@@ -9,46 +10,46 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-Numbers = Any  # NumPy arrays, or JAX arrays while a film is being computed
+Numbers = Any  # NumPy arrays, or JAX arrays while a film is computed
 
 
 class Bodies(NamedTuple):
-    """All things of one kind, also those that do not take part."""
+    """All bodies of one kind, active or not."""
 
     position: Numbers  # [n, 2], world units
-    is_present: Numbers  # [n], bool
-    heading: Numbers | None = None  # [n], rad, counter-clockwise from x; None: they look nowhere
-    group: Numbers | None = None  # [n], whole numbers: what has the same belongs together; None: all do
-    size: Numbers = 0.0  # radius of a disc or side of a square, world units; 0: a point, drawn large enough to be seen
-    seen_within: Numbers = math.inf  # world units: how far agents see them
+    is_present: Numbers  # [n], bool, false for inactive bodies
+    heading: Numbers | None = None  # [n], rad, counter-clockwise from x; None: bodies without a heading
+    group: Numbers | None = None  # [n], integers: equal numbers form a group; None: a single group
+    size: Numbers = 0.0  # radius of a disc or side of a square, world units; 0: a point, drawn with a minimum size
+    seen_within: Numbers = math.inf  # distance in world units up to which agents perceive these bodies
 
 
 class Goals(NamedTuple):
-    """Where the bodies of a group belong."""
+    """Goal positions for groups of bodies."""
 
-    position: Numbers  # [goals, 2]
-    group: Numbers  # [goals]
+    position: Numbers  # [goals, 2], world units
+    group: Numbers  # [goals], integers that match `Bodies.group`
 
 
 class Scene(NamedTuple):
-    """A square world and what is in it at one time."""
+    """A square world and its bodies at one time."""
 
-    low: Numbers  # [2], the lower left corner
-    high: Numbers  # [2]
-    is_torus: Numbers  # bool: opposite sides are one place; else they are walls
+    low: Numbers  # [2], lower left corner, world units
+    high: Numbers  # [2], upper right corner, world units
+    is_torus: Numbers  # bool: opposite sides are connected if true, and walls if false
     agents: Bodies
     evaders: Bodies | None = None
     boxes: Bodies | None = None  # oriented squares
     goals: Goals | None = None
-    is_caught: Numbers | None = None  # [evaders], bool: caught at this time
+    is_caught: Numbers | None = None  # [evaders], bool, true for evaders that are caught at this time
 
     @property
     def kinds(self) -> dict[str, Bodies]:
-        """Bodies by role, in the order in which they are numbered: first all agents, then evaders, then boxes."""
+        """Bodies by role, in the order of their numbers in the scene: agents, then evaders, then boxes."""
         roles = ("agents", "evaders", "boxes")
         return {role: bodies for role in roles if (bodies := getattr(self, role)) is not None}
 
     @property
     def num_bodies(self) -> int:
-        """Of all kinds together; of a film, in each of its frames."""
+        """Number of bodies of all kinds, in one frame."""
         return sum(np.shape(bodies.position)[-2] for bodies in self.kinds.values())

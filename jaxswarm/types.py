@@ -1,9 +1,10 @@
-"""The few data types that every floor shares."""
+"""Data types that all modules share."""
 
 import dataclasses
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 Key = jax.Array  # a typed PRNG key
@@ -12,16 +13,17 @@ T = TypeVar("T")
 
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:
-    """A dataclass field that fixes a shape or a program: part of the tree's structure, not a leaf."""
+    """Declare a static field of a `pytree`: it determines shapes or the program and is not a leaf."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
 @dataclass_transform(field_specifiers=(static,), frozen_default=True)
 def pytree(cls: type[T]) -> type[T]:
-    """Frozen dataclass that is a pytree, with `.replace`; fields made by `static()` are not leaves.
+    """Turn a class into a frozen dataclass that is a pytree and has a `replace` method.
 
-    `__post_init__` runs where somebody makes a value, not where JAX rebuilds one with leaves of its own kinds (tracers,
-    shapes, axis numbers, `None`), so it may check numbers. Run-time type checkers leave the constructor alone.
+    Fields declared with `static()` belong to the structure of the pytree; all other fields are leaves.
+    `__post_init__` may check numbers: it runs when user code creates a value. It does not run when JAX rebuilds
+    a value with other leaves (tracers, shapes, axis numbers, `None`). Run-time type checkers skip the constructor.
     """
     cls = dataclasses.dataclass(frozen=True)(cls)
     cls.replace = dataclasses.replace  # pyright: ignore[reportAttributeAccessIssue]
@@ -47,28 +49,36 @@ def pytree(cls: type[T]) -> type[T]:
     return cls
 
 
+def clip_action(action: Float[Array, "*agents action_dim"]) -> Float[Array, "*agents action_dim"]:
+    """Clip actions to the action bounds of all tasks, which are -1 and 1 in every dimension."""
+    return jnp.clip(action, -1.0, 1.0)
+
+
 @pytree
 class Entities:
-    """A group of perceived entities, by receiver; absent ones are masked, their features arbitrary but finite."""
+    """One group of perceived entities for each receiving agent.
+
+    Features in masked slots are arbitrary but finite.
+    """
 
     features: Float[Array, "*receivers slots dim"]
-    mask: Bool[Array, "*receivers slots"]
+    mask: Bool[Array, "*receivers slots"]  # true for slots that hold an entity
 
 
 @pytree
 class Observation:
-    """What agents perceive: their own state, and named groups of entities in no particular order."""
+    """Observation of each agent: features of its own state, and named groups of entities in arbitrary order."""
 
     own: Float[Array, "*receivers own_dim"]
     groups: dict[str, Entities]
-    mask: Bool[Array, "*receivers"] | None = None  # agents that exist, the others are to be ignored; None: all do
+    mask: Bool[Array, "*receivers"] | None = None  # true for active agents, others must be ignored; None: all active
 
 
 @pytree
 class Step:
-    """Outcome of one step of one world; the reward is common to all agents."""
+    """Outcome of one step of one environment; all agents share the reward."""
 
     reward: Float[Array, ""]
-    terminated: Bool[Array, ""]  # the task is over: nothing is to be had after this step
-    truncated: Bool[Array, ""]  # the time limit cut the episode: its state still has a value
+    terminated: Bool[Array, ""]  # the task has ended: the value after this step is 0
+    truncated: Bool[Array, ""]  # the time limit ended the episode: its final state still has a value
     metrics: Metrics

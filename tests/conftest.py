@@ -1,4 +1,4 @@
-"""Strict JAX for every test: shapes checked at run time, rank promotion an error."""
+"""Make JAX strict in every test: shapes are checked at run time, and rank promotion raises an error."""
 
 import os
 
@@ -12,10 +12,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config):
-    """Keeps what is compiled for other tests, for programs that they start, and for the next time tests are run.
+    """Cache compiled programs for other tests, for the programs that tests start, and for the next run of the tests.
 
-    Compiling is most of what fast tests take, so that they compile with few optimizations. The slow ones, and all
-    without `-m "not slow"`, compile as users do.
+    Fast tests spend most of their time compiling, so `-m "not slow"` compiles with few optimizations. Otherwise, tests
+    compile with all optimizations, as users do.
     """
     home = config.cache.mkdir("xdg")
     os.environ["XDG_CACHE_HOME"] = str(home)
@@ -27,7 +27,7 @@ def pytest_configure(config):
 
 @pytest.fixture
 def few_optimizations(monkeypatch):
-    """For slow tests that ask whether programs run, or run alike; compiling takes half the time."""
+    """Halve the compile time with few optimizations, for slow tests that only check whether programs run or agree."""
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     jax.config.update("jax_disable_most_optimizations", True)
     yield
@@ -36,7 +36,7 @@ def few_optimizations(monkeypatch):
 
 @pytest.fixture(scope="session")
 def run_dir(tmp_path_factory):
-    """The folder of a tiny run that has just begun."""
+    """Return the folder of a tiny run with one checkpoint."""
     from jaxswarm import config as configs  # noqa: PLC0415
     from jaxswarm.host.checkpoint import Checkpoints  # noqa: PLC0415
     from jaxswarm.training import init  # noqa: PLC0415
@@ -51,6 +51,6 @@ def run_dir(tmp_path_factory):
     (run_dir / "config.yaml").write_text(configs.dump(config))
     checkpoints = Checkpoints(run_dir / "checkpoints")
     state = init(configs.build(config), jax.random.key(0))
-    checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # of one seed
+    checkpoints.save(1, jax.tree.map(lambda x: x[None], state), {}, -3.0)  # one seed
     checkpoints.close()
     return run_dir

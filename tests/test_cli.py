@@ -21,7 +21,7 @@ from jaxswarm.cli import program as commands
 from jaxswarm.config import plugins as imports
 from jaxswarm.host import checkpoint
 from jaxswarm.host import trained as policies
-from jaxswarm.host.fit import abstract_state
+from jaxswarm.host.ensemble import abstract_state
 
 TINY = [
     *("task.num_agents=3", "task.episode_length=5", "num_envs=2", "num_steps=4", "learner.batch_size=12"),
@@ -124,7 +124,7 @@ def test_a_reader_that_goes_away_is_no_mistake():
     ("error", "part"),
     [
         (PermissionError(13, "Permission denied", "runs/x"), "Permission denied: 'runs/x'"),
-        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"), "error: out of memory; smaller"),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"), "error: out of memory; reduce"),
     ],
 )
 def test_what_machines_refuse_is_one_line(error, part, capsys):
@@ -180,7 +180,7 @@ def test_a_larger_swarm_begins_with_the_policy_of_a_smaller_one(finished, tmp_pa
     monkeypatch.chdir(finished.parent)
     overrides = [*TINY, "task.num_agents=6", "num_updates=1", "init_from=finished", f"run_dir={tmp_path / 'larger'}"]
     assert train.main(overrides) == 0
-    assert "(at first " in capsys.readouterr().out
+    assert "(warm start " in capsys.readouterr().out
     params = policies.load(finished)[1]
     larger = configs.build(configs.load(tmp_path / "larger" / "config.yaml"))
     start = jaxswarm.init(larger, jax.random.key(5))
@@ -347,7 +347,7 @@ def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path, monk
         assert process.returncode == code, (out, err)
         assert "Traceback" not in err
         if number == signal.SIGTERM:
-            assert f"continue with: jaxswarm-train resume={run_dir}" in out
+            assert f"resume with: jaxswarm-train resume={run_dir}" in out
         process = start(f"resume={run_dir}")
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, (out, err)

@@ -15,8 +15,9 @@ import pytest
 import jaxswarm
 from jaxswarm import config, files
 from jaxswarm.host import checkpoint, ensemble
-from jaxswarm.host.fit import DivergedError, abstract_state, fit, fit_runs
-from jaxswarm.host.recorder import Run
+from jaxswarm.host.ensemble import abstract_state
+from jaxswarm.host.fit import DivergedError, fit, fit_runs
+from jaxswarm.host.run import Run
 
 OVERRIDES = (
     "task.num_agents=3 task.episode_length=5 num_envs=4 num_steps=4 learner.batch_size=24 num_eval_envs=2 eval_every=3 "
@@ -113,8 +114,12 @@ def test_what_a_container_may_take_is_its_limit_less_what_it_cannot_drop(tmp_pat
 def with_a_diverging_run(tmp_path_factory):
     """Two runs of two seeds in one program, of which one diverges."""
     runs_dir = tmp_path_factory.mktemp("runs")
-    runs = [Run(x, (5, 6), runs_dir / name) for x, name in ((EXPERIMENT, "good"), (DIVERGING, "bad"))]
-    return *fit_runs(runs, 10, **OPTIONS), runs
+    runs = [Run(x, settings(10), runs_dir / name) for x, name in ((EXPERIMENT, "good"), (DIVERGING, "bad"))]
+    return *fit_runs(runs, progress=False), runs
+
+
+def settings(num_updates):
+    return config.RunSettings(seed=5, num_seeds=2, num_updates=num_updates, checkpoint_seconds=0.0)
 
 
 @pytest.mark.slow
@@ -133,10 +138,14 @@ def test_a_diverging_run_is_frozen_and_the_others_go_on(with_a_diverging_run, th
 @pytest.mark.slow
 def test_runs_of_several_experiments_resume_together(with_a_diverging_run, tmp_path):
     states, _, runs = with_a_diverging_run
-    shorter = [Run(run.experiment, run.seeds, tmp_path / run.run_dir.name) for run in runs]
-    fit_runs(shorter, 4, **OPTIONS)
-    fit_runs(shorter[:1], 7, resume=True, **OPTIONS)  # one is further than the other
-    resumed, (good, _) = fit_runs(shorter, 10, resume=True, **OPTIONS)
+
+    def train(runs, num_updates, resume):
+        runs = [Run(run.experiment, settings(num_updates), tmp_path / run.run_dir.name) for run in runs]
+        return fit_runs(runs, resume=resume, progress=False)
+
+    train(runs, 4, resume=False)
+    train(runs[:1], 7, resume=True)  # one is further than the other
+    resumed, (good, _) = train(runs, 10, resume=True)
     assert_same(resumed, states)
     assert [row["update"] for row in good if row["seed"] == 6] == [0, 3, 6, 9, 10]
 
@@ -148,7 +157,7 @@ def test_when_all_seeds_diverge_training_stops():
 
 
 def test_experiments_of_other_shapes_cannot_be_side_by_side():
-    with pytest.raises(ValueError, match="differ in numbers"):
+    with pytest.raises(ValueError, match="differ in numeric"):
         ensemble.make_batch([EXPERIMENT, EXPERIMENT.replace(num_steps=6)], 1)
 
 

@@ -13,11 +13,11 @@ import pytest
 from jaxswarm import config as configs
 from jaxswarm.analysis import curves
 from jaxswarm.analysis.curves import Curve, Line
-from jaxswarm.cli import experiment as program
+from jaxswarm.cli import figure as program
 from jaxswarm.config import ConfigError
-from jaxswarm.figures import figure as experiments
+from jaxswarm.figures import figure as figures
 from jaxswarm.figures.claims import KINDS, Claim, Measured, judge
-from jaxswarm.studies import trials
+from jaxswarm.studies import execution
 
 MEDIUM, SIMPLE = ((120, 60), (160,), "leaky_relu"), ((64,), (64,), "leaky_relu")
 MEAN_OPT, ATTENTIVE = ((174, 226, 96), (97,), "relu"), ((72,), (132, 200), "leaky_relu")
@@ -142,7 +142,7 @@ def num_parameters(experiment, counted={}):  # noqa: B006
 
 
 def test_every_figure_is_in_the_table():
-    assert RUNS.keys() | set(BEST) == set(experiments.names())
+    assert RUNS.keys() | set(BEST) == set(figures.names())
     assert not {configs.FIGURES, configs.SEARCHES} & configs.choices().keys()
 
 
@@ -151,7 +151,7 @@ def test_every_figure_is_in_the_table():
 )
 def test_every_series_is_what_was_run(name):
     per_update, batch_size, num_updates, expected = RUNS[name]
-    figure = experiments.load(name)
+    figure = figures.load_figure(name)
     assert list(figure.series) == list(expected)
     for series, (num_envs, aggregator, learner, network, count) in expected.items():
         config = compose(figure.series[series])
@@ -169,7 +169,7 @@ def test_every_series_is_what_was_run(name):
 
 @pytest.mark.parametrize("name", BEST)
 def test_our_own_settings_are_shorter_than_the_curve_beside_them(name):
-    figure, thesis_preset = experiments.load(name), (f"experiment={name.removeprefix('best_')}_thesis",)
+    figure, thesis_preset = figures.load_figure(name), (f"experiment={name.removeprefix('best_')}_thesis",)
     assert figure.references.keys() == (set() if name == "best_clustering_3" else figure.series.keys())
     thesis = configs.build(compose(thesis_preset))
     in_thesis = configs.run_settings(compose(thesis_preset)).num_updates * thesis.agent_steps_per_update
@@ -185,7 +185,7 @@ def test_our_own_settings_are_shorter_than_the_curve_beside_them(name):
 
 def test_tasks_are_those_of_the_thesis():
     def task(name):
-        return configs.build(compose(next(iter(experiments.load(name).series.values())))).task
+        return configs.build(compose(next(iter(figures.load_figure(name).series.values())))).task
 
     rendezvous, one, several = task("fig_6_1"), task("fig_6_3"), task("fig_6_5")
     assert (rendezvous.num_agents, rendezvous.torus, rendezvous.relative_velocity) == (20, False, "thesis")
@@ -200,23 +200,23 @@ def test_tasks_are_those_of_the_thesis():
 
 @pytest.mark.parametrize("name", sorted(RUNS.keys() - {"clustering_3"}))
 def test_the_thesis_reproduces_its_own_claims(name):
-    figure = experiments.load(name)
+    figure = figures.load_figure(name)
     assert figure.references.keys() == figure.series.keys()
     per_update = RUNS[name][0]
     assert max(line.x[-1] for line in figure.references.values()) == figure.num_updates * per_update
-    theirs = experiments.of_thesis(figure)
+    theirs = figures.thesis_measured(figure)
     outcomes = {claim.says: judge(claim, theirs, theirs, enough=1).outcome for claim in figure.claims}
     assert set(outcomes.values()) == {"reproduced"}, outcomes
 
 
 def test_final_levels_and_steps_are_those_that_the_thesis_was_measured_to_have():
-    pursuit = experiments.of_thesis(experiments.load("fig_6_11"))
+    pursuit = figures.thesis_measured(figures.load_figure("fig_6_11"))
     steps = [pursuit[name].steps_to(0.9) / 1e6 for name in pursuit]
     np.testing.assert_allclose(steps, [8.0, 7.5, 7.0, 4.7], atol=0.1)
-    several = experiments.of_thesis(experiments.load("fig_6_5"))
+    several = figures.thesis_measured(figures.load_figure("fig_6_5"))
     finals = [several[name].final() for name in ("Bayesian agg.", "Mean agg.", "Attentive agg.", "Max Agg.")]
     np.testing.assert_allclose(finals, [31.7, 37.7, 20.0, 37.5], atol=0.06)
-    best = experiments.of_thesis(experiments.load("fig_6_6"))
+    best = figures.thesis_measured(figures.load_figure("fig_6_6"))
     np.testing.assert_allclose([best[name].final() for name in best], [42.2, 47.3, 28.3], atol=0.06)
 
 
@@ -254,7 +254,7 @@ def test_each_kind_of_claim_is_a_number(kind, series, fields, expected):
 
 
 def test_every_kind_is_in_a_figure():
-    assert {claim.kind for name in RUNS for claim in experiments.load(name).claims} == KINDS.keys()
+    assert {claim.kind for name in RUNS for claim in figures.load_figure(name).claims} == KINDS.keys()
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def trained(tmp_path):
     """Makes a run folder of figure 6.15's first series that looks as if these seeds had been trained."""
 
     def write(name, seed, num_seeds, level=1.0, **changes):
-        overrides = experiments.load("fig_6_15").series["μ only"]
+        overrides = figures.load_figure("fig_6_15").series["μ only"]
         changes |= {"seed": seed, "num_seeds": num_seeds}
         config = configs.compose([*overrides, *(f"{key}={value}" for key, value in changes.items())])
         (tmp_path / name).mkdir()
@@ -357,10 +357,10 @@ def seeds_of(trials):
 
 
 def test_only_seeds_that_are_missing_are_trained(trained, tmp_path):
-    figure = experiments.load("fig_6_15")
+    figure = figures.load_figure("fig_6_15")
 
     def plan(num_seeds):
-        return experiments.plan(figure, tmp_path, experiments.stored(tmp_path), num_seeds)["μ only"]
+        return figures.plan(figure, tmp_path, figures.find_runs(tmp_path), num_seeds)["μ only"]
 
     assert seeds_of(plan(4)) == [(0, 1, 2, 3)]
     first, second = trained("first", 0, 2), trained("second", 5, 1)
@@ -375,19 +375,19 @@ def test_only_seeds_that_are_missing_are_trained(trained, tmp_path):
 
 
 def test_a_seed_that_two_folders_hold_counts_once(trained, tmp_path):
-    figure = experiments.load("fig_6_15")
+    figure = figures.load_figure("fig_6_15")
     for name, level in (("one", 1.0), ("other", 1.0001)):
         trained(name, 0, 4, level)
-    found = experiments.stored(tmp_path)
-    ours = experiments.measure(figure, experiments.plan(figure, tmp_path, found), found, lambda text: None)
+    found = figures.find_runs(tmp_path)
+    ours = figures.measure(figure, figures.plan(figure, tmp_path, found), found, lambda text: None)
     assert ours["μ only"].num_seeds == 4
 
 
 def test_of_the_best_third_of_seeds_only_these_are_shown(trained, tmp_path):
-    figure = dataclasses.replace(experiments.load("fig_6_15"), best_share=1 / 3, num_seeds=6)
+    figure = dataclasses.replace(figures.load_figure("fig_6_15"), best_share=1 / 3, num_seeds=6)
     trained("six", 0, 6)  # seed s is at 1 + s
-    found = experiments.stored(tmp_path)
-    ours = experiments.measure(figure, experiments.plan(figure, tmp_path, found), found, lambda text: None)["μ only"]
+    found = figures.find_runs(tmp_path)
+    ours = figures.measure(figure, figures.plan(figure, tmp_path, found), found, lambda text: None)["μ only"]
     assert (ours.num_seeds, figure.num_shown) == (2, 2)
     np.testing.assert_allclose([ours.line.lower[0], ours.line.y[0], ours.line.upper[0]], [5.25, 5.5, 5.75])
     rng = np.random.default_rng(1)
@@ -409,7 +409,7 @@ def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
     odd = trained("odd", 0, 2, num_envs=40, num_steps=51)
     (odd / "config.yaml").write_text((odd / "config.yaml").read_text() + "gone: 1\n")  # a key of another version
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
-    assert f"warning: {odd} is of no figure" in capsys.readouterr().err
+    assert f"warning: {odd} belongs to no figure" in capsys.readouterr().err
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| μ only | 2 |" in report
     assert "Trained on cpu, revisions of the code: 0123456789ab." in report
@@ -424,24 +424,24 @@ def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
 
 
 def test_what_is_kept_of_a_run_is_all_that_reports_read(trained, tmp_path):
-    figure, whole = experiments.load("fig_6_15"), trained("whole", 0, 2)
-    (folder,) = experiments.stored(tmp_path)
-    experiments.keep(folder, tmp_path / "kept")
-    (kept,) = experiments.stored(tmp_path / "kept")
+    figure, whole = figures.load_figure("fig_6_15"), trained("whole", 0, 2)
+    (folder,) = figures.find_runs(tmp_path)
+    figures.keep_results(folder, tmp_path / "kept")
+    (kept,) = figures.find_runs(tmp_path / "kept")
     assert (kept.config, kept.rows) == (folder.config, folder.rows)
-    assert experiments.origin(kept) == experiments.origin(folder)
+    assert figures.origin(kept) == figures.origin(folder)
     for found in ([folder], [kept]):
-        (trial, *_) = experiments.plan(figure, tmp_path, found, num_seeds=2)["μ only"]
+        (trial, *_) = figures.plan(figure, tmp_path, found, num_seeds=2)["μ only"]
         assert trial.run_dir == found[0].path
     text = (whole / "metrics.csv").read_text()
     (whole / "metrics.csv").write_text(text + "400,40800000,0,0,1\n")
-    (longest,) = experiments.stored(tmp_path / "kept", tmp_path)
+    (longest,) = figures.find_runs(tmp_path / "kept", tmp_path)
     assert longest.path == whole
 
 
 def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):
-    (first,) = experiments.plan(experiments.load("fig_6_5"), tmp_path, scale=0.1)["Bayesian agg."]
-    (second,) = experiments.plan(experiments.load("fig_6_15"), tmp_path)["μ only"]
+    (first,) = figures.plan(figures.load_figure("fig_6_5"), tmp_path, scale=0.1)["Bayesian agg."]
+    (second,) = figures.plan(figures.load_figure("fig_6_15"), tmp_path)["μ only"]
     assert first.run_dir == second.run_dir
     assert (first.num_updates, second.num_updates) == (40, 343)
     assert (first.settings.num_seeds, second.settings.num_seeds) == (16, 16)
@@ -449,14 +449,14 @@ def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):
 
 def test_wrong_words_are_errors(capsys):
     with pytest.raises(ConfigError, match="fig_6_1, "):
-        experiments.load("fig_9_9")
+        figures.load_figure("fig_9_9")
     for overrides, message in [
-        (["fig_9_9"], "is no figure"),
+        (["fig_9_9"], "figure: must be one of all, "),
         (["fig_6_15", "scale=2"], "a number above 0"),
-        (["fig_6_15", "seeds=0"], "integers from 1"),
+        (["fig_6_15", "seeds=0"], "an integer >= 1"),
         (["fig_6_15", "series=mu*"], "'μ only', 'μ+σ²'"),
         (["fig_6_15", "num_seeds=2"], "write seeds=N"),
-        (["all", "seeds=3"], "no meaning here"),
+        (["all", "seeds=3"], "all trains nothing"),
     ]:
         assert program.main(overrides) == 2
         assert message in capsys.readouterr().err
@@ -466,13 +466,13 @@ def test_wrong_words_are_errors(capsys):
 @pytest.mark.usefixtures("few_optimizations")
 def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     overrides = ["fig_6_15", "seeds=2", f"dir={tmp_path}", *TINY]
-    real, lengths = trials.train, []
+    real, lengths = execution.train, []
 
     def train(together):
         lengths.append(together[0].num_updates)
         return real(together)
 
-    monkeypatch.setattr(trials, "train", train)
+    monkeypatch.setattr(execution, "train", train)
     assert program.main([*overrides, "scale=0.006", "series=*only"]) == 0
     assert "not enough runs" in capsys.readouterr().out
     assert program.main([*overrides, "scale=0.006"]) == 0  # trains the other one

@@ -11,11 +11,10 @@ import pytest
 import jaxswarm
 from jaxswarm import config, files
 from jaxswarm.config import ConfigError
-from jaxswarm.host import checkpoint, ensemble
-from jaxswarm.host import fit as fitting
-from jaxswarm.host import recorder as recording
+from jaxswarm.host import batch_recorder, checkpoint, ensemble, recorder
 from jaxswarm.host.fit import DivergedError, fit, fit_runs
-from jaxswarm.host.recorder import Recorder, Run, locked, started_and_new
+from jaxswarm.host.recorder import Recorder
+from jaxswarm.host.run import Run, locked, split_started
 from jaxswarm.tasks import Rendezvous
 from jaxswarm.types import pytree
 
@@ -106,14 +105,15 @@ def test_another_run_is_not_resumed(undisturbed, tmp_path, changes, seed, messag
 
 def test_a_run_is_not_started_anew_because_one_beside_it_is_new(undisturbed, tmp_path):
     shutil.copytree(undisturbed[2], tmp_path / "begun")
-    runs = [Run(EXPERIMENT, (3,), tmp_path / name) for name in ("begun", "new")]
+    settings = config.RunSettings(seed=3, num_updates=NUM_UPDATES)
+    runs = [Run(EXPERIMENT, settings, tmp_path / name) for name in ("begun", "new")]
     with pytest.raises(FileExistsError, match=r"begun holds a run and .*new does not"):
-        fit_runs(runs, NUM_UPDATES, resume=True, **OPTIONS)
+        fit_runs(runs, resume=True, progress=False)
     assert table(tmp_path / "begun") == table(undisturbed[2])
-    assert started_and_new([tmp_path / "new", tmp_path / "newer"]) == ([tmp_path / "new", tmp_path / "newer"], [])
+    assert split_started([tmp_path / "new", tmp_path / "newer"]) == ([tmp_path / "new", tmp_path / "newer"], [])
     (tmp_path / "new").mkdir(exist_ok=True)
     shutil.copy(tmp_path / "begun" / "metrics.csv", tmp_path / "new")  # killed between the first saves of the two
-    assert started_and_new([tmp_path / "begun", tmp_path / "new"]) == ([tmp_path / "begun", tmp_path / "new"], [])
+    assert split_started([tmp_path / "begun", tmp_path / "new"]) == ([tmp_path / "begun", tmp_path / "new"], [])
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_the_run_folder_is_complete(undisturbed):
     seconds = [row["wall_seconds"] for row in files.read_rows(run_dir / "metrics.csv")]
     assert seconds == sorted(seconds)
     best = max(undisturbed[1], key=lambda row: row["eval/return"])
-    restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT), "best")
+    restored = checkpoint.restore(run_dir / "checkpoints", ensemble.abstract_state(EXPERIMENT), "best")
     assert (restored.update, np.float32(restored.score)) == (best["update"], np.float32(best["eval/return"]))
 
 
@@ -205,7 +205,7 @@ def test_two_processes_do_not_train_into_one_folder(tmp_path):
 
 
 def test_chunks_of_any_length_give_the_same(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr(batch_recorder, "SECONDS_PER_CHUNK", 0.0)
     state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=tmp_path / "run", **OPTIONS)
     assert_same_state(state, undisturbed[0])
     assert table(tmp_path / "run") == table(undisturbed[2])
@@ -262,7 +262,7 @@ def test_a_signal_ends_the_run_after_a_checkpoint(undisturbed, tmp_path, monkeyp
         state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, **(OPTIONS | {"checkpoint_seconds": 1e9}))
     assert 0 < int(state.update) < NUM_UPDATES
     assert signal.getsignal(number) == handlers[0]
-    restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT))
+    restored = checkpoint.restore(run_dir / "checkpoints", ensemble.abstract_state(EXPERIMENT))
     assert restored.update == int(state.update)
     assert_resumes_to_the_same(run_dir, undisturbed)
 
@@ -296,14 +296,14 @@ def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkp
     diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
     with pytest.raises(DivergedError, match=r"is (nan|inf|not finite) at update \d"):
         fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)
-    restored = checkpoint.restore(run_dir / "checkpoints", fitting.abstract_state(EXPERIMENT))
+    restored = checkpoint.restore(run_dir / "checkpoints", ensemble.abstract_state(EXPERIMENT))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(restored.train_state.learner.params))
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_optimizations")
 def test_the_curve_grows_during_training(tmp_path, monkeypatch):
-    monkeypatch.setattr(recording, "SECONDS_PER_CURVE", 0.0)
+    monkeypatch.setattr(recorder, "SECONDS_PER_CURVE", 0.0)
     curve, sizes = tmp_path / "run" / "curve.png", []
     fit(
         EXPERIMENT,

@@ -1,4 +1,4 @@
-"""The notebooks are stored without results, open in Colab, install what they need, and run from top to bottom."""
+"""The notebooks are stored without outputs, open in Colab, install jaxswarm if needed, and run from top to bottom."""
 
 import ast
 from pathlib import Path
@@ -10,7 +10,7 @@ NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 REPOSITORY = "https://github.com/jaxswarm/jaxswarm"
 COLAB = f"https://colab.research.google.com/github/{REPOSITORY.removeprefix('https://github.com/')}/blob/main/notebooks"
 SMALL = {"num_agents": 3, "episode_length": 6, "num_updates": 2, "num_envs": 2}
-TINY = {  # what the cell of parameters is replaced by
+TINY = {  # assigned after the cell with the tag `parameters`
     "quickstart": SMALL,
     "compare_aggregators": SMALL | {"aggregators": ("max",), "num_seeds": 2},
     "write_a_task": SMALL,
@@ -70,7 +70,7 @@ def test_the_first_code_installs_where_it_is_needed(name):
 
 
 def test_tiny_sizes_replace_parameters_and_nothing_else(name):
-    """All of them but the seed and the choice of an aggregator."""
+    """Every parameter has a tiny value, except the seed and the aggregator."""
     assigned = {node.targets[0].id: node.value for node in ast.parse(parameters(read(name)).source).body}
     assert TINY[name].keys() <= assigned.keys()
     assert assigned.keys() - TINY[name].keys() <= {"seed", "aggregator"}
@@ -88,8 +88,8 @@ def test_links_between_notebooks_lead_somewhere(name):
 def test_notebooks_run(name, tmp_path, monkeypatch):
     client = pytest.importorskip("nbclient")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    monkeypatch.setenv("JAX_NUMPY_RANK_PROMOTION", "raise")  # as in all tests
-    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")  # what takes time here is compiling
+    monkeypatch.setenv("JAX_NUMPY_RANK_PROMOTION", "raise")  # as in all other tests
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compiling takes most of the time
     notebook = read(name)
     cell = parameters(notebook)
     cell.source = "\n".join([cell.source, *(f"{key} = {value!r}" for key, value in TINY[name].items())])

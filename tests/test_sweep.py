@@ -1,6 +1,7 @@
 """Sweeps and searches of tiny experiments, through the program that users call."""
 
 import csv
+import dataclasses
 import json
 import math
 import shutil
@@ -15,12 +16,20 @@ from jaxswarm.cli import evaluate
 from jaxswarm.cli import sweep as program
 from jaxswarm.config import ConfigError
 from jaxswarm.host import fit
+from jaxswarm.host.run import Run
 from jaxswarm.learners.on_policy import batch_size
+from jaxswarm.studies import execution, search
 from jaxswarm.studies import grid as sweep
-from jaxswarm.studies import search, trials
 
 OVERRIDES = [*TINY, "num_updates=4", "num_seeds=2"]
 SWEPT = [*OVERRIDES, "learner.learning_rate=1e-4..1e-2:3log", "network.activation=tanh,relu", "render_every=1"]
+
+
+def shortened(runs, num_updates):
+    """The runs as if they had been interrupted after so many updates."""
+    return [
+        dataclasses.replace(run, settings=dataclasses.replace(run.settings, num_updates=num_updates)) for run in runs
+    ]
 
 
 @pytest.mark.parametrize(
@@ -46,7 +55,7 @@ def test_impossible_ranges_are_errors(word):
 
 
 def test_what_fixes_a_shape_has_a_program_of_its_own(tmp_path):
-    trials = sweep.trials(sweep.expand(SWEPT), tmp_path)
+    trials = sweep.runs(sweep.expand(SWEPT), tmp_path)
     assert len(trials) == 6
     assert [len(together) for together in sweep.programs(trials)] == [3, 3]
     names = [trial.run_dir.name for trial in trials]
@@ -56,23 +65,23 @@ def test_what_fixes_a_shape_has_a_program_of_its_own(tmp_path):
 
 def test_equal_runs_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="differ only in"):
-        sweep.trials(sweep.expand([*OVERRIDES, "seed=1,2"]), tmp_path)
+        sweep.runs(sweep.expand([*OVERRIDES, "seed=1,2"]), tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_optimizations")
 def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, capsys):
     sweep_dir, begun = tmp_path / "sweep", []
-    real = trials.fit_runs
+    real = execution.fit_runs
 
-    def stops_in_the_second_program(runs, num_updates, **options):
+    def stops_in_the_second_program(runs, **options):
         begun.append(runs)
-        return real(runs, 2 if len(begun) == 2 else num_updates, **options)
+        return real(shortened(runs, 2) if len(begun) == 2 else runs, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(trials, "fit_runs", stops_in_the_second_program)
+        patch.setattr(execution, "fit_runs", stops_in_the_second_program)
         assert program.main([*SWEPT, f"sweep_dir={sweep_dir}"]) == 0
-    assert "stopped; continue with" in capsys.readouterr().out
+    assert "stopped; resume with" in capsys.readouterr().out
     assert not (sweep_dir / "summary.csv").exists()
     assert program.main([f"resume={sweep_dir}"]) == 0
     with open(sweep_dir / "summary.csv", newline="") as file:
@@ -111,15 +120,15 @@ def test_a_seed_that_diverges_counts_with_its_worst():
 
 
 def test_what_diverged_counts_as_evaluated_to_its_end(tmp_path, monkeypatch):
-    (trial,) = sweep.trials(sweep.expand([*OVERRIDES, "num_updates=7"]), tmp_path)
-    assert trial.num_evaluations == 4  # before updates 0, 3, 6, and after the last
+    (run,) = sweep.runs(sweep.expand([*OVERRIDES, "num_updates=7"]), tmp_path)
+    assert run.num_evaluations == 4  # before updates 0, 3, 6, and after the last
     rows = [[{"update": 0, "seed": 1, "eval/return": -6.0}]]
 
     def diverge(*_, **__):
         raise fit.DivergedError("training stopped", rows)
 
-    monkeypatch.setattr(trials, "fit_runs", diverge)
-    assert trials.train([trial], progress=False) == (True, rows)
+    monkeypatch.setattr(execution, "fit_runs", diverge)
+    assert execution.train([run], progress=False) == (True, rows)
 
 
 def test_what_the_command_line_says_is_not_searched():
@@ -143,7 +152,7 @@ def test_runs_with_seeds_that_diverged_come_last():
     wanted = config.compose(OVERRIDES)
 
     def trial(number):
-        return trials.Trial(wanted, config.build(wanted), Path(f"run{number}"))
+        return Run.from_config(wanted, Path(f"run{number}"))
 
     rows = [
         [{"update": 4, "seed": s, "eval/return": x} for s, x in enumerate(xs)] for xs in ([9.0], [1.0, 2.0], [3.0, 4.0])
@@ -226,11 +235,11 @@ def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, mo
     storage = tmp_path / "journal.log"
     overrides = [*OVERRIDES, f"search={tmp_path / 'space.yaml'}", "trials=3", f"storage={storage}"]
     overrides = [word for word in overrides if "batch_size" not in word]
-    real = trials.fit_runs
+    real = execution.fit_runs
     with monkeypatch.context() as patch:
-        patch.setattr(trials, "fit_runs", lambda runs, num_updates, **options: real(runs, 2, **options))
+        patch.setattr(execution, "fit_runs", lambda runs, **options: real(shortened(runs, 2), **options))
         assert program.main([*overrides, f"sweep_dir={tmp_path / 'one'}"]) == 0
-    assert "stopped; continue with" in capsys.readouterr().out
+    assert "stopped; resume with" in capsys.readouterr().out
     assert program.main([*overrides, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over
     study = search.open_study(str(storage))
     complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
@@ -244,6 +253,6 @@ def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, mo
 
 def test_wrong_words_are_errors(tmp_path, capsys):
     assert program.main(["trials=3", "learner.learning_rate=1,2"]) == 2
-    assert "without search=NAME" in capsys.readouterr().err
+    assert "trials: must be used with search=NAME" in capsys.readouterr().err
     assert program.main([f"resume={tmp_path}"]) == 2
     assert "not the folder of a sweep" in capsys.readouterr().err

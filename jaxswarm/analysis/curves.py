@@ -1,7 +1,7 @@
 """Statistics of learning curves over seeds: common grids, medians, interquartile means, profiles, times to a threshold.
 
-Seeds are evaluated at points of their own, and some end before others. Between its evaluations a seed is interpolated
-linearly, outside of them it is not counted, so that the number of seeds behind a point may differ along a line.
+Seeds may be evaluated at different points, and some may end before others. A seed is interpolated linearly between its
+evaluations and not counted outside of them. The number of seeds may therefore differ between the points of a line.
 """
 
 import csv
@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-MAX_POINTS = 1000  # of a line; more are thinned out evenly
-NUM_RESAMPLES = 2000
+MAX_POINTS = 1000  # per line; longer grids are thinned out evenly
+NUM_RESAMPLES = 2000  # bootstrap resamples per interval
 CONFIDENCE = 0.95
-COLUMNS = ("series", "agent_steps", "median", "q25", "q75")  # of files with lines to compare with
+COLUMNS = ("series", "agent_steps", "median", "q25", "q75")  # of CSV files with reference lines
 
 Values = Float[np.ndarray, "seeds points"]
 Points = Float[np.ndarray, " points"]
@@ -35,18 +35,21 @@ class Curve:
 
 @dataclasses.dataclass(frozen=True)
 class Line:
-    """A statistic over seeds with its band; the band is NaN where there is none, as for a single seed."""
+    """Statistic over seeds with its band. The band is NaN where it is undefined, such as for a single seed."""
 
     x: Points
     y: Points
     lower: Points
     upper: Points
-    num_seeds: Int[np.ndarray, " points"]  # behind each point
+    num_seeds: Int[np.ndarray, " points"]  # that have a value at each point
 
 
 @dataclasses.dataclass(frozen=True)
 class Statistic:
-    """A way to make a line and its band of seeds' values, which are NaN where a seed has none."""
+    """Function that computes a line, its lower and its upper bound from the values of seeds.
+
+    The values are NaN where a seed has none. `name` and `band` describe the line and its band in captions.
+    """
 
     name: str
     band: str
@@ -54,29 +57,31 @@ class Statistic:
 
 
 def from_rows(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> tuple[dict[int, Curve], int]:
-    """Each seed's curve through two columns, and how many evaluations were left out because they are not finite.
+    """Return the curve of each seed through the columns `x` and `y`, and the number of evaluations left out.
 
-    A seed without a finite evaluation has no curve. What is measured in training has no value in a seed's first row,
-    before the first update: that is not counted.
+    Evaluations are left out if they are not finite. A seed without a finite evaluation has no curve. Training metrics
+    have no value in the first row of a seed, which is written before the first update; this row is not counted. If a
+    seed has several rows at the same `x`, the last one is used.
     """
-    points = defaultdict(list)
+    points_by_seed = defaultdict(list)
     for row in rows:
-        points[row["seed"]].append((row.get(x, math.nan), row.get(y, math.nan)))
+        points_by_seed[row["seed"]].append((row.get(x, math.nan), row.get(y, math.nan)))
     curves, num_left_out = {}, 0
-    for seed in sorted(points):
-        mine = np.array(points[seed], float)
-        is_finite = np.all(np.isfinite(mine), axis=1)
+    for seed in sorted(points_by_seed):
+        points = np.array(points_by_seed[seed], float)
+        is_finite = np.all(np.isfinite(points), axis=1)
         num_left_out += np.count_nonzero(~is_finite[0 if y.startswith("eval/") else 1 :])
         if is_finite.any():
-            at, last = np.unique(mine[is_finite, 0][::-1], return_index=True)
-            curves[seed] = Curve(at, mine[is_finite, 1][::-1][last])
+            distinct_x, last = np.unique(points[is_finite, 0][::-1], return_index=True)
+            curves[seed] = Curve(distinct_x, points[is_finite, 1][::-1][last])
     return curves, int(num_left_out)
 
 
 def read_lines(path: Path) -> dict[str, Line]:
-    """The lines of a CSV file by their names; numbers of runs are in a column `n_runs`, or not known: 0.
+    """Return the lines of a CSV file with `COLUMNS` by their names (column `series`).
 
-    A `ValueError` says what is wrong in the file.
+    An optional column `n_runs` holds the number of runs; without it the number is 0, that is unknown. Raises a
+    `ValueError` that names the fault of an invalid file.
     """
     try:
         with open(path, encoding="utf-8", newline="") as file:
@@ -85,19 +90,19 @@ def read_lines(path: Path) -> dict[str, Line]:
         raise ValueError(str(error)) from error
     missing = [name for name in COLUMNS if not rows or name not in rows[0]]
     if missing:
-        raise ValueError(f"it has no column {missing[0]}; it needs {', '.join(COLUMNS)}")
+        raise ValueError(f"the file has no column {missing[0]}; required columns: {', '.join(COLUMNS)}")
     lines = {}
     for name in dict.fromkeys(row["series"] for row in rows):
-        mine = [row for row in rows if row["series"] == name]
-        x, middle, lower, upper = np.array([[float(row[column] or "nan") for column in COLUMNS[1:]] for row in mine]).T
+        points = [row for row in rows if row["series"] == name]
+        x, middle, lower, upper = np.array([[float(row[key] or "nan") for key in COLUMNS[1:]] for row in points]).T
         if not np.isfinite(x).all():
-            raise ValueError(f"agent_steps of {name!r} are not all numbers")
-        lines[name] = Line(x, middle, lower, upper, np.array([int(row.get("n_runs") or 0) for row in mine]))
+            raise ValueError(f"agent_steps: must be finite numbers, got others in series {name!r}")
+        lines[name] = Line(x, middle, lower, upper, np.array([int(row.get("n_runs") or 0) for row in points]))
     return lines
 
 
 def trailing_mean(curve: Curve, size: int) -> Curve:
-    """Each evaluation averaged with up to `size - 1` before it, never with later ones."""
+    """Return the mean of each evaluation and up to `size - 1` evaluations before it."""
     sums = np.concatenate([[0.0], np.cumsum(curve.y)])
     end = np.arange(1, len(curve.y) + 1)
     start = np.maximum(end - size, 0)
@@ -105,7 +110,10 @@ def trailing_mean(curve: Curve, size: int) -> Curve:
 
 
 def on_common_grid(curves: Sequence[Curve]) -> tuple[Points, Values]:
-    """All points at which any seed was evaluated, and the seeds' values there; NaN outside of a seed's own range."""
+    """Return all points at which any seed was evaluated, and the interpolated values of the seeds there.
+
+    Values are NaN outside of the range of a seed. At most `MAX_POINTS` points are kept, spread evenly.
+    """
     grid = np.unique(np.concatenate([curve.x for curve in curves]))
     if len(grid) > MAX_POINTS:
         grid = grid[np.linspace(0, len(grid) - 1, MAX_POINTS).round().astype(int)]
@@ -114,7 +122,10 @@ def on_common_grid(curves: Sequence[Curve]) -> tuple[Points, Values]:
 
 
 def summarize(curves: Sequence[Curve], statistic: str, best_share: float = 1.0) -> Line:
-    """One of `STATISTICS` along the common grid of at least one seed; of the best `best_share` of the seeds."""
+    """Return one of `STATISTICS` along the common grid of the seeds.
+
+    Only the best `best_share` of the seeds are used (a share in (0, 1], at least one seed).
+    """
     grid, values = on_common_grid(curves)
     values = _best(values, best_share)
     y, lower, upper = STATISTICS[statistic].compute(values)
@@ -124,28 +135,31 @@ def summarize(curves: Sequence[Curve], statistic: str, best_share: float = 1.0) 
 def bootstrapped(
     curves: Sequence[Curve], statistic: str, count: int, generator: np.random.Generator, best_share: float = 1.0
 ) -> list[Line]:
-    """`summarize` of as many seeds drawn with replacement, `count` times; where none of them is, of all seeds."""
+    """Return `summarize` of `count` bootstrap resamples, each of as many seeds as there are, with replacement.
+
+    At points where no seed of a resample has a value, its line has the statistic of all seeds.
+    """
     grid, values = on_common_grid(curves)
-    of_all = STATISTICS[statistic].compute(_best(values, best_share))
+    full_sample = STATISTICS[statistic].compute(_best(values, best_share))
     lines = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of points without any seed
+        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy warns at points without any seed
         for _ in range(count):
-            drawn = _best(values[generator.integers(len(values), size=len(values))], best_share)
-            points = STATISTICS[statistic].compute(drawn)
-            is_there = ~np.isnan(drawn).all(axis=0)
-            y, lower, upper = (np.where(is_there, x, other) for x, other in zip(points, of_all, strict=True))
-            lines.append(Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(drawn), axis=0)))
+            resample = _best(values[generator.integers(len(values), size=len(values))], best_share)
+            points = STATISTICS[statistic].compute(resample)
+            has_value = ~np.isnan(resample).all(axis=0)
+            y, lower, upper = (np.where(has_value, x, other) for x, other in zip(points, full_sample, strict=True))
+            lines.append(Line(grid, y, lower, upper, np.count_nonzero(~np.isnan(resample), axis=0)))
     return lines
 
 
 def num_best(num_seeds: int, share: float) -> int:
-    """How many seeds are the best `share` of so many."""
+    """Return the number of seeds in the best `share` of `num_seeds`: rounded, and at least 1."""
     return max(1, round(share * num_seeds))
 
 
 def _best(values: Values, share: float) -> Float[np.ndarray, "best points"]:
-    """The seeds with the highest means over the points that all have."""
+    """Return the seeds with the highest means over the points at which all seeds have a value."""
     if share == 1.0:
         return values
     means = values[:, ~np.isnan(values).any(axis=0)].mean(axis=1)
@@ -153,9 +167,9 @@ def _best(values: Values, share: float) -> Float[np.ndarray, "best points"]:
 
 
 def profile(finals: Float[np.ndarray, " seeds"], at: Points) -> Line:
-    """Performance profile: the fraction of seeds that end above each value (Agarwal et al., 2021, eq. 1).
+    """Return the performance profile: the fraction of seeds that end above each value (Agarwal et al., 2021, eq. 1).
 
-    The band is that of `interquartile_mean`, for the fraction.
+    The band is a 95 % bootstrap interval of the fraction, computed as in `interquartile_mean`.
     """
     is_above = (finals[:, None] > at).astype(float)
     lower, upper = _bootstrap(is_above, np.mean)
@@ -165,25 +179,29 @@ def profile(finals: Float[np.ndarray, " seeds"], at: Points) -> Line:
 def times_to(
     curves: Sequence[Curve], threshold: float
 ) -> tuple[Float[np.ndarray, " seeds"], Bool[np.ndarray, " seeds"]]:
-    """Where each seed's evaluation is first at or above the threshold, and whether it ever is; else where it ends."""
-    first = [np.flatnonzero(curve.y >= threshold) for curve in curves]
-    times = [curve.x[found[0] if found.size else -1] for curve, found in zip(curves, first, strict=True)]
-    return np.array(times), np.array([found.size > 0 for found in first])
+    """Return the `x` at which each seed first reaches the threshold, and whether it reaches it at all.
+
+    A seed reaches the threshold with its first evaluation at or above it. Otherwise its `x` is that of its last
+    evaluation.
+    """
+    above = [np.flatnonzero(curve.y >= threshold) for curve in curves]
+    times = [curve.x[indices[0] if indices.size else -1] for curve, indices in zip(curves, above, strict=True)]
+    return np.array(times), np.array([indices.size > 0 for indices in above])
 
 
 def reaching(curves: Sequence[Curve], threshold: float) -> Line:
-    """Fraction of seeds that have reached a threshold, as estimated by Kaplan and Meier (1958).
+    """Return the fraction of seeds that have reached a threshold, estimated by Kaplan and Meier (1958).
 
-    A seed that ended below the threshold is one of those that may reach it until its end, and says nothing of what is
-    later. The band is the 95 % interval by the exponential Greenwood formula, NaN where no seed or every seed is
-    there. `num_seeds` are the seeds that have neither reached the threshold nor ended before a point.
+    A seed that ends below the threshold is censored: it counts as at risk until its end, and not after it. The band is
+    the 95 % interval by the exponential Greenwood formula. It is NaN where no seed or every seed has reached the
+    threshold. `num_seeds` counts the seeds at risk, which have neither reached the threshold nor ended before a point.
     """
     from scipy import stats  # noqa: PLC0415
 
     times, is_reached = times_to(curves, threshold)
     estimate = stats.ecdf(stats.CensoredData(uncensored=times[is_reached], right=times[~is_reached])).cdf
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of the points without an interval
+        warnings.simplefilter("ignore", RuntimeWarning)  # SciPy warns at points without an interval
         interval = estimate.confidence_interval(CONFIDENCE, method="log-log")
     start = min(curve.x[0] for curve in curves)
     x = np.concatenate([[start], estimate.quantiles])
@@ -193,26 +211,29 @@ def reaching(curves: Sequence[Curve], threshold: float) -> Line:
 
 
 def median(values: Values) -> tuple[Points, Points, Points]:
-    """Median with the quartiles, interpolated linearly between seeds."""
+    """Return median, lower and upper quartile over seeds, interpolated linearly between seeds.
+
+    The quartiles are NaN where fewer than two seeds have a value.
+    """
     lower, middle, upper = np.nanpercentile(values, (25, 50, 75), axis=0)
     is_single = np.count_nonzero(~np.isnan(values), axis=0) < 2
     return middle, np.where(is_single, math.nan, lower), np.where(is_single, math.nan, upper)
 
 
 def interquartile_mean(values: Values) -> tuple[Points, Points, Points]:
-    """Mean without the lowest and the highest quarter of seeds, with a 95 % bootstrap interval (Agarwal et al., 2021).
+    """Return the mean without the lowest and the highest quarter of seeds, and its 95 % bootstrap interval.
 
-    A quarter is rounded down, so nothing is cut from fewer than four seeds. Their bootstrap is stratified by task; all
-    seeds here have one task, so they are the only stratum, of which as many are redrawn as there are. The interval is
-    made of percentiles of the redrawn means; it is NaN for a single seed.
+    Source: Agarwal et al. (2021). A quarter is rounded down, so nothing is cut from fewer than four seeds. Their
+    bootstrap is stratified by task. All seeds here have one task and form a single stratum, and each resample has as
+    many seeds as there are. The bounds are percentiles of the means of the resamples; they are NaN for a single seed.
     """
-    is_there = ~np.isnan(values)
-    patterns, which = np.unique(is_there, axis=1, return_inverse=True)
+    has_value = ~np.isnan(values)
+    patterns, pattern_of_point = np.unique(has_value, axis=1, return_inverse=True)  # of seeds that have a value
     result = np.empty((3, values.shape[1]))
     for number, seeds in enumerate(patterns.T):
-        points = which.ravel() == number
-        there = values[np.ix_(seeds, points)]
-        result[:, points] = _trimmed_mean(there, axis=0), *_bootstrap(there, _trimmed_mean)
+        points = pattern_of_point.ravel() == number
+        present = values[np.ix_(seeds, points)]
+        result[:, points] = _trimmed_mean(present, axis=0), *_bootstrap(present, _trimmed_mean)
     return result[0], result[1], result[2]
 
 
@@ -229,10 +250,10 @@ def _trimmed_mean(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _bootstrap(values: Values, statistic: Callable[..., np.ndarray]) -> tuple[Points, Points]:
-    """Percentile interval of a statistic over seeds; the same seeds are redrawn at all points."""
+    """Return the bootstrap percentile interval of a statistic over seeds; all points share the resamples of seeds."""
     if len(values) < 2:
-        nothing = np.full(values.shape[1], math.nan)
-        return nothing, nothing
+        undefined = np.full(values.shape[1], math.nan)
+        return undefined, undefined
     from scipy import stats  # noqa: PLC0415
 
     interval = stats.bootstrap(

@@ -1,7 +1,7 @@
-"""Pictures of lines with bands, and the tables of what is in them.
+"""Plots of lines with bands, and CSV tables of the plotted points.
 
-The colors are those of Okabe and Ito (2008) without yellow, which paper swallows; markers tell lines apart without
-color. Each series keeps its place in the order, and with it color and marker.
+The colors are those of Okabe and Ito (2008) without yellow, which is hard to see on white paper. Markers distinguish
+the lines without color. The position of a series in the order determines its color and its marker.
 """
 
 import csv
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-DASHES = ((0, (5, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (9, 2)), (0, (1, 1.2)))  # of references
-FORMATS: dict[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}  # and metadata
+DASHES = ((0, (5, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (9, 2)), (0, (1, 1.2)))  # line styles of references
+FORMATS: dict[str, dict[str, Any]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}  # with metadata
 COLUMNS = ("kind", "series", "num_seeds", "x_name", "x", "y_name", "y", "lower", "upper")
-SETTINGS: Any = {  # the same picture is the same file; its words stay words, whatever is in them
+SETTINGS: Any = {  # equal plots give equal files; text is stored as text and is not parsed as math
     "svg.hashsalt": "jaxswarm",
     "svg.fonttype": "none",
     "pdf.fonttype": 42,
     "text.parse_math": False,
 }
-LEGEND_INSIDE = 4  # longer legends are put below the axes, as are those of step lines, which fill all of them
-LINE_LENGTH = 104  # characters of small text that a picture has room for
-UNITS = {  # of an axis: what from which value on
+LEGEND_INSIDE = 4  # series; longer legends are below the axes, and so are legends of step lines, which fill the axes
+LINE_LENGTH = 104  # characters of small text that fit into the width of a plot
+UNITS = {  # of an axis: (least maximum of the axis for the unit, size of the unit, label)
     "agent_steps": ((1e6, 1e6, "million agent steps"), (1e3, 1e3, "thousand agent steps"), (0, 1, "agent steps")),
     "wall_seconds": ((7200, 3600, "hours"), (120, 60, "minutes"), (0, 1, "seconds")),
 }
@@ -43,19 +43,23 @@ UNITS = {  # of an axis: what from which value on
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """A line of a picture; `label` is its name, `note` what the legend says of it besides."""
+    """Line of a plot. The legend shows its name `label`, and its `note` in brackets."""
 
     label: str
     line: Line
     note: str = ""
     is_reference: bool = False
-    censored: Points = dataclasses.field(default_factory=lambda: np.empty(0))  # where seeds ended before the event
-    seeds: Sequence[Curve] = ()  # drawn thin behind the line
+    censored: Points = dataclasses.field(default_factory=lambda: np.empty(0))  # ends of seeds without the event
+    seeds: Sequence[Curve] = ()  # plotted as thin lines
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
-    """What is to be drawn, in data units; `log` names the logarithmic axes, `""`, `"x"`, `"y"` or `"xy"`."""
+class Plot:
+    """Specification of a plot, in data units.
+
+    `kind` is written into the table. `x_name` and `y_name` are the names of the columns, `y_label` is the label of the
+    vertical axis. `log` names the logarithmic axes: `""`, `"x"`, `"y"` or `"xy"`. `is_step` plots lines as steps.
+    """
 
     kind: str
     series: Sequence[Series]
@@ -68,19 +72,19 @@ class Picture:
     is_step: bool = False
 
 
-def draw(path: Path, picture: Picture) -> None:
-    """Draws into a file of a format of `FORMATS`, its suffix; a file is there completely or not at all."""
+def draw(path: Path, plot: Plot) -> None:
+    """Draw the plot into a file, whose suffix is one of `FORMATS`. The file is written completely or not at all."""
     from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     with rc_context(rc=SETTINGS):
         figure = Figure(figsize=(7, 4.4), layout="constrained")
         axes = figure.subplots()
-        shown = _in_units(picture)
-        _draw_lines(axes, shown)
-        _draw_frame(axes, shown)
-        is_inside = not picture.is_step and len(picture.series) <= LEGEND_INSIDE
-        _draw_legend(figure, axes, textwrap.fill(picture.caption, LINE_LENGTH), is_inside)
+        scaled = _in_units(plot)
+        _draw_lines(axes, scaled)
+        _draw_frame(axes, scaled)
+        is_inside = not plot.is_step and len(plot.series) <= LEGEND_INSIDE
+        _draw_legend(figure, axes, textwrap.fill(plot.caption, LINE_LENGTH), is_inside)
         temporary = path.with_name(f".{path.name}.tmp")
         try:
             suffix = path.suffix[1:].lower()
@@ -90,40 +94,43 @@ def draw(path: Path, picture: Picture) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def table(picture: Picture) -> str:
-    """The points of a picture as CSV, a line each; cells are empty where there is no band or no known number."""
+def table(plot: Plot) -> str:
+    """Return the points of a plot as CSV, one row per point.
+
+    Cells are empty where there is no band or where the number of seeds is unknown.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for series in picture.series:
-        kind, line = ("reference" if series.is_reference else picture.kind), series.line
+    for series in plot.series:
+        kind, line = ("reference" if series.is_reference else plot.kind), series.line
         for n, x, y, lower, upper in zip(line.num_seeds, line.x, line.y, line.lower, line.upper, strict=True):
             cells = map(_cell, (y, lower, upper))
-            writer.writerow([kind, series.label, n or "", picture.x_name, _cell(x), picture.y_name, *cells])
+            writer.writerow([kind, series.label, n or "", plot.x_name, _cell(x), plot.y_name, *cells])
         for x, y in zip(series.censored, _heights(line, series.censored), strict=True):
-            writer.writerow(["censored", series.label, 1, picture.x_name, _cell(x), picture.y_name, _cell(y), "", ""])
+            writer.writerow(["censored", series.label, 1, plot.x_name, _cell(x), plot.y_name, _cell(y), "", ""])
     return buffer.getvalue()
 
 
 def seed_count(number: int) -> str:
-    """So many seeds, in words."""
+    """Return the text "1 seed" or "N seeds"."""
     return "1 seed" if number == 1 else f"{number} seeds"
 
 
-def check(picture: Picture) -> None:
-    """A `ValueError` for a logarithmic axis that cannot show the values."""
-    x, y = _x_values(picture), _y_values(picture)
-    if "x" in picture.log and not (x > 0).any():
-        raise ValueError(f"log: {picture.x_name} must have values above zero, got none")
-    if "y" in picture.log and y.min() <= 0 <= y.max():
+def check(plot: Plot) -> None:
+    """Raise a `ValueError` if a logarithmic axis cannot show the values."""
+    x, y = _x_values(plot), _y_values(plot)
+    if "x" in plot.log and not (x > 0).any():
+        raise ValueError(f"log: {plot.x_name} must have positive values, got none")
+    if "y" in plot.log and y.min() <= 0 <= y.max():
         between = f"{y.min():g} to {y.max():g}"
-        raise ValueError(f"log: values of {picture.y_name} must have one sign, got {between}")
+        raise ValueError(f"log: values of {plot.y_name} must have one sign, got {between}")
 
 
-def _in_units(picture: Picture) -> Picture:
-    """The picture in the unit of its horizontal axis, after which that is called."""
-    most = _x_values(picture).max(initial=0)
-    units = UNITS.get(picture.x_name, ((-math.inf, 1, picture.x_name),))
+def _in_units(plot: Plot) -> Plot:
+    """Return the plot with its horizontal axis scaled to a readable unit, whose label becomes `x_name`."""
+    most = _x_values(plot).max(initial=0)
+    units = UNITS.get(plot.x_name, ((-math.inf, 1, plot.x_name),))
     size, label = next((size, label) for least, size, label in units if most >= least)
     scaled = [
         dataclasses.replace(
@@ -132,43 +139,44 @@ def _in_units(picture: Picture) -> Picture:
             censored=series.censored / size,
             seeds=[dataclasses.replace(seed, x=seed.x / size) for seed in series.seeds],
         )
-        for series in picture.series
+        for series in plot.series
     ]
-    return dataclasses.replace(picture, series=scaled, x_name=label)
+    return dataclasses.replace(plot, series=scaled, x_name=label)
 
 
-def _draw_lines(axes: "Axes", picture: Picture) -> None:
-    """Our lines by their place, the references behind them in a tint of the color of the line with the same name.
+def _draw_lines(axes: "Axes", plot: Plot) -> None:
+    """Draw our series in order, and the references below them.
 
-    Those without a namesake have tints of the colors that remain.
+    A reference has a tint of the color of our series with the same label. The other references have tints of the
+    remaining colors. A single series of ours without references is annotated with its last value.
     """
-    ours = [series for series in picture.series if not series.is_reference]
-    references = [series for series in picture.series if series.is_reference]
+    ours = [series for series in plot.series if not series.is_reference]
+    references = [series for series in plot.series if series.is_reference]
     for number, series in enumerate(ours):
         style = {"color": COLORS[number % len(COLORS)], "linewidth": 1.8, "zorder": 4}
         every = max(1, len(series.line.x) // 12)
-        marker = MARKERS[(number + number // len(COLORS)) % len(MARKERS)]  # another one when colors come again
+        marker = MARKERS[(number + number // len(COLORS)) % len(MARKERS)]  # differs when colors repeat
         marks = {"marker": marker, "markersize": 4, "markevery": (number % every, every)}
-        style |= marks | ({"drawstyle": "steps-post"} if picture.is_step else {})
-        _draw_line(axes, series, picture.is_step, 0.2, style)
+        style |= marks | ({"drawstyle": "steps-post"} if plot.is_step else {})
+        _draw_line(axes, series, plot.is_step, 0.2, style)
     labels = list(dict.fromkeys(series.label for series in [*ours, *references]))
     for number, series in enumerate(references):
         color = _tint(COLORS[labels.index(series.label) % len(COLORS)])
         style = {"color": color, "linewidth": 1.4, "linestyle": DASHES[number % len(DASHES)], "zorder": 2}
-        _draw_line(axes, series, picture.is_step, 0.12, style)
-    if len(ours) == 1 and not references and len(ours[0].line.x) and not picture.is_step:
+        _draw_line(axes, series, plot.is_step, 0.12, style)
+    if len(ours) == 1 and not references and len(ours[0].line.x) and not plot.is_step:
         end, text = (ours[0].line.x[-1], ours[0].line.y[-1]), _signed(ours[0].line.y[-1])
-        ground = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-        axes.annotate(text, end, (6, 0), textcoords="offset points", va="center", annotation_clip=False, bbox=ground)
+        box = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+        axes.annotate(text, end, (6, 0), textcoords="offset points", va="center", annotation_clip=False, bbox=box)
 
 
 def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, style: dict[str, Any]) -> None:
-    """Line, band, seeds and marks; pale where some seeds have ended."""
+    """Draw line, band, seeds and marks of censored seeds. The line is pale where some seeds have no value."""
     line = series.line
     for seed in series.seeds:
         axes.plot(seed.x, seed.y, color=style["color"], alpha=0.4, linewidth=0.6, zorder=3)
-    behind = {"color": style["color"], "alpha": band_alpha, "linewidth": 0, "zorder": 1}
-    axes.fill_between(line.x, line.lower, line.upper, step="post" if is_step else None, **behind)
+    band = {"color": style["color"], "alpha": band_alpha, "linewidth": 0, "zorder": 1}
+    axes.fill_between(line.x, line.lower, line.upper, step="post" if is_step else None, **band)
     is_shared_by_all = (line.num_seeds == line.num_seeds.max(initial=0)) | is_step
     if not is_shared_by_all.all():
         axes.plot(line.x, line.y, alpha=0.45, **style)
@@ -178,21 +186,21 @@ def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, s
     axes.plot(series.censored, _heights(line, series.censored), "|", **ticks)
 
 
-def _draw_frame(axes: "Axes", picture: Picture) -> None:
-    axes.set_title(picture.title, loc="left", fontsize=11)
-    axes.set_xlabel(picture.x_name)
-    axes.set_ylabel(picture.y_label)
-    if "x" in picture.log:
-        _set_logarithmic(axes, "x", _x_values(picture))
-    if "y" in picture.log:
-        _set_logarithmic(axes, "y", _y_values(picture))
+def _draw_frame(axes: "Axes", plot: Plot) -> None:
+    axes.set_title(plot.title, loc="left", fontsize=11)
+    axes.set_xlabel(plot.x_name)
+    axes.set_ylabel(plot.y_label)
+    if "x" in plot.log:
+        _set_logarithmic(axes, "x", _x_values(plot))
+    if "y" in plot.log:
+        _set_logarithmic(axes, "y", _y_values(plot))
     axes.grid(color="0.92", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def _set_logarithmic(axes: "Axes", name: str, values: np.ndarray) -> None:
-    """A logarithmic axis with ticks at 1, 2, 5, 10, ...; of negative numbers it is the mirror image."""
+    """Make an axis logarithmic, with ticks at 1, 2, 5, 10, .... Negative values have a mirrored logarithmic axis."""
     from matplotlib import ticker  # noqa: PLC0415
 
     axis, subs = getattr(axes, f"{name}axis"), (1.0, 2.0, 5.0)
@@ -209,7 +217,7 @@ def _set_logarithmic(axes: "Axes", name: str, values: np.ndarray) -> None:
 
 
 def _draw_legend(figure: "Figure", axes: "Axes", caption: str, is_inside: bool) -> None:
-    """A legend in the axes, or below them in a figure that grows by it; the caption is always below."""
+    """Draw the legend in the axes, or below them in an enlarged figure. The caption is always below the axes."""
     handles, labels = axes.get_legend_handles_labels()
     labels = [textwrap.fill(label, LINE_LENGTH - 10) for label in labels]
     style: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelspacing": 0.35}
@@ -226,25 +234,25 @@ def _draw_legend(figure: "Figure", axes: "Axes", caption: str, is_inside: bool) 
     figure.legend(handles, labels, loc="outside lower left", **style).get_title().set_color("0.35")
 
 
-def _x_values(picture: Picture) -> np.ndarray:
-    return np.concatenate([np.empty(0), *(series.line.x for series in picture.series)])
+def _x_values(plot: Plot) -> np.ndarray:
+    return np.concatenate([np.empty(0), *(series.line.x for series in plot.series)])
 
 
-def _y_values(picture: Picture) -> np.ndarray:
-    """All finite heights, bands and seeds included."""
-    lines = [series.line for series in picture.series]
-    seeds = [seed.y for series in picture.series for seed in series.seeds]
+def _y_values(plot: Plot) -> np.ndarray:
+    """Return all finite `y` values, including those of bands and seeds."""
+    lines = [series.line for series in plot.series]
+    seeds = [seed.y for series in plot.series for seed in series.seeds]
     values = np.concatenate([np.empty(0), *seeds, *(x for line in lines for x in (line.y, line.lower, line.upper))])
     return values[np.isfinite(values)]
 
 
 def _heights(line: Line, at: Points) -> Points:
-    """Where a step line is at these points."""
+    """Return the values of a step line at these points."""
     return line.y[np.searchsorted(line.x, at, side="right") - 1]
 
 
 def _tint(color: str) -> str:
-    """Two fifths of the way to white."""
+    """Return the color mixed with two fifths of white."""
     channels = (int(color[i : i + 2], 16) for i in (1, 3, 5))
     return "#" + "".join(f"{(3 * channel + 2 * 255) // 5:02x}" for channel in channels)
 

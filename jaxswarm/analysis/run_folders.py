@@ -1,4 +1,4 @@
-"""Run folders: found, read, and put into groups of seeds that are named by what their configs do not share."""
+"""Run folders: search, reading, and groups of runs with equal settings, labeled by the settings that differ."""
 
 import contextlib
 import dataclasses
@@ -18,15 +18,15 @@ from jaxswarm.analysis.curves import Curve
 from jaxswarm.config import ConfigError
 from jaxswarm.files import Row, read_rows
 
-# keys that change neither a world nor a policy: seed, length, checkpoints, and when to look
+# keys that change neither a task nor a policy: seed, length, checkpoints, and times of evaluation
 NOT_COMPARED = {"eval_every", *(field.name for field in dataclasses.fields(configs.RunSettings))} - {configs.INIT_FROM}
 
-Fields = dict[str, Any]  # a config by dotted key, without those that are not compared
+Fields = dict[str, Any]  # a config by dotted keys, without those in NOT_COMPARED
 
 
 @dataclasses.dataclass(frozen=True)
 class RunFolder:
-    """What a run left behind, of one seed or of several."""
+    """Content of a run folder, which holds one or more seeds: config and evaluations."""
 
     path: Path
     config: Fields
@@ -34,22 +34,22 @@ class RunFolder:
 
 
 def find(paths: Sequence[Path]) -> list[Path]:
-    """All run folders at or below the paths, each once; a `ConfigError` for a path without any."""
+    """Return all run folders at or below the paths, each once. Raise a `ConfigError` for a path without run folders."""
     found: dict[Path, Path] = {}
     for path in paths:
         if not path.is_dir():
-            raise ConfigError(f"{path} is not a folder: give run folders, or folders that contain run folders")
-        here = list(_run_folders(path))
-        if not here:
-            raise ConfigError(f"{path} contains no run folder, that is a folder with config.yaml and metrics.csv")
-        found |= {folder.resolve(): folder for folder in here}
+            raise ConfigError(f"PATH: must be a run folder or a folder that contains run folders, got {str(path)!r}")
+        folders = list(_run_folders(path))
+        if not folders:
+            raise ConfigError(f"{path} contains no run folder, which is a folder with config.yaml and metrics.csv")
+        found |= {folder.resolve(): folder for folder in folders}
     return list(found.values())
 
 
 def read(path: Path) -> RunFolder:
-    """Reads config and evaluations; a `ConfigError` says which file is not what it should be."""
+    """Read config and evaluations of a run folder. Raise a `ConfigError` that names the file if one is invalid."""
     nested = configs.read(path / "config.yaml")
-    with contextlib.suppress(ConfigError):  # the config of another version stays as it is
+    with contextlib.suppress(ConfigError):  # a config of another version is used unchanged
         nested = configs.validate(nested)
     try:
         rows = read_rows(path / "metrics.csv")
@@ -57,17 +57,17 @@ def read(path: Path) -> RunFolder:
         raise ConfigError(f"cannot read {path / 'metrics.csv'}: {error}") from error
     missing = [name for name in ("update", "agent_steps", "seed") if rows and name not in rows[0]]
     if missing:
-        raise ConfigError(f"cannot read {path / 'metrics.csv'}: it has no column {missing[0]}")
+        raise ConfigError(f"cannot read {path / 'metrics.csv'}: the file has no column {missing[0]}")
     return RunFolder(path, fields(nested), rows)
 
 
 def fields(config: configs.Config) -> Fields:
-    """A config as `Fields`."""
+    """Flatten a config to dotted keys, without the keys that are not compared."""
     return {name: x for name, x in configs.flat(config).items() if name not in NOT_COMPARED}
 
 
 def group(folders: Sequence[RunFolder]) -> dict[str, list[RunFolder]]:
-    """Folders whose configs agree in what is compared, by a label of what the groups do not agree in."""
+    """Group folders whose compared settings are equal. The keys are labels: the settings that differ between groups."""
     groups = defaultdict(list)
     for folder in folders:
         groups[json.dumps(folder.config, sort_keys=True)].append(folder)
@@ -76,10 +76,11 @@ def group(folders: Sequence[RunFolder]) -> dict[str, list[RunFolder]]:
 
 
 def label(configs_of_groups: Sequence[Fields]) -> list[str]:
-    """A name for each of several different configs: the values that differ, or the names of parts that do.
+    """Return a label for each of several different configs: the settings that differ, as "key=value, ...".
 
-    Of a part such as the aggregator its name is enough, unless groups with the same name differ, too. Several fields
-    of the network are given as the name of a preset if all groups use one. A single group is called by its parts.
+    If a part such as the aggregator differs, the label has only its name, and its fields only if parts of the same
+    name differ. If several fields of the network differ and every group uses a preset, the label has the name of the
+    preset. The label of a single group is the names of its parts.
     """
     if len(configs_of_groups) == 1:
         return [common_name(configs_of_groups) or "runs"]
@@ -93,7 +94,7 @@ def label(configs_of_groups: Sequence[Fields]) -> list[str]:
 
 
 def common_name(configs_of_groups: Sequence[Fields]) -> str:
-    """Names of the parts that all configs share, like `rendezvous, mean, ppo`."""
+    """Return the names of the parts that all configs share, such as "rendezvous, mean, ppo"."""
     names = [{fields.get(f"{part}.name") for fields in configs_of_groups} for part in configs.REGISTERED]
     return ", ".join(name for choices in names if len(choices) == 1 for name in choices if name)
 
@@ -101,21 +102,21 @@ def common_name(configs_of_groups: Sequence[Fields]) -> str:
 def seeds(
     folders: Sequence[RunFolder], x: str, y: str, warn: Callable[[str], object], *, once: bool = False
 ) -> list[Curve]:
-    """A curve for each seed of a group.
+    """Return a curve for each seed of a group.
 
-    A seed that two folders hold with the same numbers, as a copy or a longer run does, counts once; with `once` also
-    one that they hold with other numbers, as two devices may give. The longer one is counted. What is left out, and
-    seeds that occur more than once, are told to `warn`, one line each.
+    A seed that two folders hold with equal values (a copy or a resumed run) counts once, and the longer curve is used.
+    With `once`, a seed also counts once if its values differ, as they may between devices. `warn` is called with one
+    line for everything that is left out and for each seed that occurs more than once.
     """
     kept: dict[int, list[_Seed]] = defaultdict(list)
     for folder in folders:
         mine, num_left_out = curves.from_rows(folder.rows, x, y)
         if num_left_out:
-            warn(f"{folder.path}: {num_left_out} evaluations left out, {y} is not a finite number there")
+            warn(f"{folder.path}: left out {num_left_out} evaluations whose {y} is not finite")
         absent = sorted({row["seed"] for row in folder.rows} - mine.keys())
         if absent or not folder.rows:
-            numbers = f"seed {', '.join(map(str, absent))}" if absent else "the run"
-            warn(f"{folder.path}: {numbers} not counted, there is no finite {y}")
+            missing = f"seed {', '.join(map(str, absent))}" if absent else "the run"
+            warn(f"{folder.path}: left out {missing} without a finite {y}")
         by_update, _ = curves.from_rows(folder.rows, "update", y)
         for number, curve in mine.items():
             seed = _Seed(folder.path, by_update[number], curve)
@@ -124,24 +125,24 @@ def seeds(
                 kept[number].append(seed)
                 continue
             other = kept[number][same]
-            warn(f"{folder.path}: seed {number} is that of {other.path}; the longer one is counted")
+            warn(f"{folder.path}: seed {number} is also in {other.path}; only the longer one is counted")
             kept[number][same] = max(other, seed, key=lambda one: one.by_update.x[-1])
     for number, several in kept.items():
         if len(several) > 1:
             names = ", ".join(str(seed.path) for seed in several)
-            warn(f"seed {number} occurs {len(several)} times with different numbers, each is counted: {names}")
+            warn(f"seed {number} occurs {len(several)} times with different values; each one is counted: {names}")
     return [seed.curve for several in kept.values() for seed in several]
 
 
 class _Seed(NamedTuple):
-    """A seed of a folder: over updates, for comparison, and over what is asked for."""
+    """Curve of a seed of a folder: over updates, for comparison, and over the requested column."""
 
     path: Path
     by_update: Curve
     curve: Curve
 
     def is_same(self, other: "_Seed") -> bool:
-        """Whether all that both evaluated agrees."""
+        """Return whether both have equal values at all updates at which both were evaluated."""
         _, mine, others = np.intersect1d(self.by_update.x, other.by_update.x, return_indices=True)
         return mine.size > 0 and np.array_equal(self.by_update.y[mine], other.by_update.y[others])
 
@@ -155,7 +156,7 @@ def _run_folders(path: Path) -> Iterator[Path]:
 
 
 def _differences(fields: Fields, all_fields: Sequence[Fields]) -> dict[str, str]:
-    """What tells a config from others; the fields of a registered part only from those with the same part."""
+    """Return the settings that differ from other configs. Fields of a part are compared only if its name is equal."""
     texts = {}
     for key in dict.fromkeys(key for other in all_fields for key in other):
         name = f"{key.partition('.')[0]}.name"
@@ -167,7 +168,7 @@ def _differences(fields: Fields, all_fields: Sequence[Fields]) -> dict[str, str]
 
 
 def _network_presets(all_fields: Sequence[Fields]) -> list[str] | None:
-    """Names of the network presets that the configs use, if they differ in more than one field and all use one."""
+    """Return the names of the network presets if several network fields differ and each config uses a preset."""
     keys = {key for fields in all_fields for key in fields if key.startswith("network.")}
     keys = {key for key in keys if any(other.get(key) != all_fields[0].get(key) for other in all_fields)}
     if len(keys) < 2:
@@ -177,12 +178,12 @@ def _network_presets(all_fields: Sequence[Fields]) -> list[str] | None:
     for fields in all_fields:
         wanted: Mapping[str, Any] = {key.partition(".")[2]: fields.get(key) for key in keys}
         fitting = [choice for choice, preset in values.items() if wanted.items() <= preset.items()]
-        names += fitting[-1:]  # small, not its other name simple
+        names += fitting[-1:]  # the last alias: "small", not "simple"
     return names if len(names) == len(all_fields) else None
 
 
 def _short(key: str, keys: set[str]) -> str:
-    """The field's name alone where only one part has it."""
+    """Return the key without its part if this is unambiguous."""
     leaf = key.rpartition(".")[2]
     if leaf == "name":
         return key.partition(".")[0]
@@ -190,13 +191,13 @@ def _short(key: str, keys: set[str]) -> str:
 
 
 def _text(value: Any) -> str:
-    """The value as one would type it."""
+    """Return the value as a user types it on the command line."""
     if isinstance(value, float):
         return f"{value:g}"
     return json.dumps(value, separators=(",", ":")).strip('"')
 
 
 def _by_number(text: str) -> list[str | float]:
-    """A key that sorts numbers in a text by their size."""
+    """Return a sort key that orders numbers in the text by size."""
     parts = re.split(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)", text)
     return [float(part) if number % 2 else part for number, part in enumerate(parts)]

@@ -1,4 +1,4 @@
-"""`curve.png` of a run: its evaluation return against agent steps."""
+"""Learning curve of a run, `curve.png`: evaluation return against agent steps."""
 
 import math
 from collections.abc import Sequence
@@ -11,21 +11,22 @@ from jaxswarm.files import RETURN, Row
 
 
 def draw_curve(path: Path, rows: Sequence[Row], title: str) -> None:
-    """Evaluation return against agent steps; the figure's format is the suffix.
+    """Draw the evaluation return against agent steps. The suffix of `path` determines the format: png, svg or pdf.
 
-    Of several seeds it shows the median with the quartiles, and each seed thin behind it; of one the mean with the
+    Several seeds are shown as median with quartiles, and each seed as a thin line. One seed is shown as mean with the
     standard deviation over episodes.
     """
     seeds, _ = curves.from_rows(rows, "agent_steps", RETURN)
     if len(seeds) > 1:
-        line, what = curves.summarize(list(seeds.values()), "median"), f"median and quartiles of {len(seeds)} seeds"
+        line = curves.summarize(list(seeds.values()), "median")
+        statistic = f"median and quartiles of {len(seeds)} seeds"
         series = plots.Series("", line, seeds=list(seeds.values()))
     else:
-        line, what = _mean_over_episodes(rows), "mean ± std"
+        line, statistic = _mean_over_episodes(rows), "mean ± std"
         series = plots.Series("", line)
-    label = f"return of an episode ({what})"
+    label = f"return of an episode ({statistic})"
     caption = "pale where some seeds have no evaluation" if np.unique(line.num_seeds).size > 1 else ""
-    plots.draw(path, plots.Picture("curve", [series], "agent_steps", RETURN, label, title=title, caption=caption))
+    plots.draw(path, plots.Plot("curve", [series], "agent_steps", RETURN, label, title=title, caption=caption))
 
 
 def _mean_over_episodes(rows: Sequence[Row]) -> curves.Line:

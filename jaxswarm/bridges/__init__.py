@@ -1,4 +1,4 @@
-"""Tasks with the interfaces of other libraries."""
+"""Adapters that give tasks the interfaces of other libraries."""
 
 from jaxswarm.bridges.gymnax import Gymnax
 

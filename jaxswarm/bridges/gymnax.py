@@ -1,4 +1,4 @@
-"""Tasks with the interfaces of other libraries, which need not be installed."""
+"""Adapter that gives a task the interface of gymnax 1.0. Only `action_space` requires gymnax to be installed."""
 
 import dataclasses
 from typing import Any
@@ -7,50 +7,56 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxswarm.types import Key, Observation
+from jaxswarm.types import Key, Observation, clip_action
 
 
-@dataclasses.dataclass(frozen=True, eq=False)  # hashed by identity, for those who compile `step`
+@dataclasses.dataclass(frozen=True, eq=False)  # hashed by identity, so `env.step` can be jitted
 class Gymnax:
-    """One world of a task as an environment of gymnax 1.0.
+    """Environment with the interface of gymnax 1.0 for one instance of a task.
 
         env = Gymnax(jaxswarm.make("rendezvous"))
         obs, state = env.reset(key)
         obs, state, reward, terminated, truncated, info = env.step(key, state, action)
 
-    Observations and actions are those of all agents, the reward is common to them. `params`, where they are given, are
-    a task in place of the environment's own, as `env.default_params.replace(visibility_radius=0.3)`; numbers that fix
-    no shape may be traced. A world that is over restarts within `step`; `info` then has what was to be seen before,
-    `final_observation`, beside both flags and the metrics of the task. That a start state is drawn at every step is the
-    price of this interface, which `jaxswarm.train` does not pay.
+    Observations and actions are those of all agents, and all agents share the reward. All methods are pure functions;
+    use `jax.vmap` for several environments.
+
+    The argument `params` is a task that replaces the environment's own, such as
+    `env.default_params.replace(visibility_radius=0.3)`. Its numeric fields that determine no shape may be traced.
+
+    `step` samples a start state at every step, because it resets within `step`. `jaxswarm.train` avoids this cost.
     """
 
-    task: Any
+    task: Any  # frozen pytree of `jaxswarm.TASKS`
 
     @property
     def name(self) -> str:
-        """Of the task's class."""
+        """Name of the task's class."""
         return type(self.task).__name__
 
     @property
     def default_params(self) -> Any:
-        """The environment's own task."""
+        """Task of this environment, the default of `params`."""
         return self.task
 
     @property
     def num_actions(self) -> int:
-        """Numbers that an agent chooses at every step."""
+        """Size of the action of one agent, `action_dim`."""
         return self.task.action_dim
 
     def action_space(self, params: Any = None) -> Any:
-        """A `Box` from -1 to 1, [agents, num_actions]; the one thing that takes gymnax to be installed."""
+        """Return the gymnax space `Box(-1, 1)` of shape [agents, action_dim]. Requires gymnax."""
         from gymnax.environments import spaces  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
 
         task = self.task if params is None else params
         return spaces.Box(-1.0, 1.0, (task.num_agents, task.action_dim))
 
     def reset(self, key: Key, params: Any = None) -> tuple[Observation, Any]:
-        """What agents see of a fresh world, and its state."""
+        """Sample a start state; return the observation and the state.
+
+        The observation has `own` [agents, own_dim] and `groups`, a dict from group names to `features`
+        [agents, slots, dim] and `mask` [agents, slots] (True where a slot holds an entity).
+        """
         task = self.task if params is None else params
         state = task.reset(key)
         return task.observe(state), state
@@ -58,10 +64,17 @@ class Gymnax:
     def step(
         self, key: Key, state: Any, action: Float[Array, "agents action_dim"], params: Any = None
     ) -> tuple[Observation, Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], dict[str, Any]]:
-        """Observation, state, reward, terminated, truncated and info; actions are clipped to [-1, 1]."""
+        """Take a step; return (observation, state, reward, terminated, truncated, info).
+
+        `action` is [agents, action_dim] and is clipped to [-1, 1]. `reward` is a scalar; `terminated` and `truncated`
+        are scalar bools. If either is true, the returned observation and state are those of a new episode.
+
+        `info` is a dict with the scalar metrics of the task, `terminated`, `truncated`, and `final_observation`: the
+        observation after the step and before a reset, which has the bootstrap value at truncation.
+        """
         task = self.task if params is None else params
         step_key, reset_key = jax.random.split(key)
-        final_state, outcome = task.step(step_key, state, jnp.clip(action, -1.0, 1.0))
+        final_state, outcome = task.step(step_key, state, clip_action(action))
         is_done = outcome.terminated | outcome.truncated
         state = jax.tree.map(lambda a, b: jnp.where(is_done, a, b), task.reset(reset_key), final_state)
         flags = {"terminated": outcome.terminated, "truncated": outcome.truncated}

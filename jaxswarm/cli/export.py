@@ -5,43 +5,50 @@ from pathlib import Path
 
 from jaxswarm import config as configs
 from jaxswarm.cli.policy_options import policy_on_task
-from jaxswarm.cli.program import load, only_of_task, program, split_paths, use_compile_cache, wants_help
+from jaxswarm.cli.program import load_config, program, require_task_keys, split_paths, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
 
 HELP = """\
-jaxswarm-export PATH [out=FILE] [checkpoint=best|last] [train_seed=N] [task.key=value] ...
+jaxswarm-export PATH [key=value ...] [task.KEY=VALUE ...]
 
-Writes the policy of a run folder as one file, PATH/policy.jax unless `out` names another: a program from observations
-to means and standard deviations of actions, its parameters inside, that runs wherever JAX does, without jaxswarm. It
-takes any number of agents at a time, be it one robot, and has slots for what agents of this task can perceive; those
-not needed are masked. Act by the mean, clipped to [-1, 1] as the worlds do. Of a run with several seeds it is the
-policy of the first, or of train_seed.
+Writes the policy of a run folder to one file. The file contains a program from observations to means and standard
+deviations of the actions, with the parameters. It runs wherever JAX runs, and jaxswarm need not be installed. The
+program takes any number of agents, also a single robot. It has slots for everything that an agent of the task can
+perceive, and unneeded slots are masked. Use the mean as the action, clipped to [-1, 1] as in the tasks.
+
+options
+  PATH             Run folder. Required.
+  out=FILE         Path of the file, default: PATH/policy.jax.
+  checkpoint=NAME  Checkpoint: best or last, default: best. The best one has the highest mean return over the seeds.
+  train_seed=N     Seed of the run whose policy is exported. Integer, default: the first seed.
+  task.KEY=VALUE   Change a field of the task, which determines the number of slots. The type is that of the field,
+                   default: the task of the run.
 
 examples
   jaxswarm-export runs/thesis
   jaxswarm-export runs/thesis task.num_agents=100 out=policy.jax     # up to 99 neighbors
 """
 USE = """\
-with jax and flatbuffers:
+use it with the packages jax and flatbuffers:
   from jax import export
   policy = export.deserialize(open("{path}", "rb").read())
   mean, std = policy.call(own, groups)
-own is {own}, groups {groups}: features and mask of each\
+own is {own}, groups is {groups}: (features, mask) of each group\
 """
 OPTIONS = ("out", "checkpoint", "train_seed")
 
 
 @program
 def main(arguments: Sequence[str]) -> int:
-    """Exports the policy of a run; returns the exit code."""
+    """Export the policy of a run; return the exit code."""
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
     paths, options, overrides = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
-        raise ConfigError(f"give one run folder, not {len(paths)}: jaxswarm-export PATH [key=value ...]")
+        raise ConfigError(f"PATH: must be one run folder, got {len(paths)}; use jaxswarm-export PATH [key=value ...]")
     pairs = configs.parse(overrides)
-    only_of_task(pairs, load(paths[0]), OPTIONS)
+    require_task_keys(pairs, load_config(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "policy.jax"))
     use_compile_cache()
     found = policy_on_task(paths[0], pairs, options)

@@ -13,7 +13,7 @@ from jaxswarm.analysis import run_folders as runs
 from jaxswarm.analysis.curves import STATISTICS, Curve
 from jaxswarm.analysis.plots import Picture, Series
 from jaxswarm.analysis.run_folders import RunFolder
-from jaxswarm.cli.program import program, split, wants_help, whole
+from jaxswarm.cli.program import parse_integer, program, split, wants_help
 from jaxswarm.config import ConfigError, schema
 from jaxswarm.files import replace_text
 
@@ -68,7 +68,7 @@ class Options:
             if getattr(self, name) not in accepted:
                 choices = ", ".join(filter(None, accepted))
                 raise ConfigError(f"{name}: must be one of {choices}, got {getattr(self, name)!r}")
-        whole("smooth", self.smooth, 1)
+        parse_integer("smooth", self.smooth, 1)
         if self.kind == "threshold" and not _is_number(self.threshold):
             raise ConfigError(f"threshold: must be a number, like threshold=-30, got {self.threshold!r}")
         if self.threshold and self.kind != "threshold":

@@ -6,18 +6,36 @@ from typing import Any
 
 from jaxswarm import config as configs
 from jaxswarm.cli.policy_options import policy_on_task
-from jaxswarm.cli.program import load, only_of_task, program, split_paths, use_compile_cache, wants_help, whole
+from jaxswarm.cli.program import (
+    load_config,
+    parse_integer,
+    program,
+    require_task_keys,
+    split_paths,
+    use_compile_cache,
+    wants_help,
+)
 from jaxswarm.config import ConfigError
 
 HELP = """\
-jaxswarm-render PATH [PATH ...] [out=FILE] [checkpoint=best|last] [seed=N] [train_seed=N] [task.key=value] ...
+jaxswarm-render PATH... [key=value ...] [task.KEY=VALUE ...]
 
-Plays an episode of each run's policy, side by side, and writes it in the format of the suffix of `out`. `seed` is that
-of the episode; of a run with several seeds it is the policy of the first, or of train_seed.
-  .html  one page that needs no network: play, scrub, click an agent to see what it looks at (default: replay.html)
-  .png   a strip of frames=N pictures (6), evenly spaced up to step until=N (the end)
-  .gif   a moving picture of frames=N pictures (150), up to step until=N
-  .mp4   every step, up to step until=N; needs ffmpeg
+Records one episode of the policy of each run and writes the episodes next to each other into one file. The suffix of
+the file determines its format:
+  .html  An offline page with playback. Click an agent to see what it perceives.
+  .png   A strip of evenly spaced frames.
+  .gif   An animation of evenly spaced frames.
+  .mp4   A video of every step. It needs ffmpeg.
+
+options
+  PATH...          One or more run folders. Required.
+  out=FILE         Path of the file, default: replay.html in the first PATH.
+  checkpoint=NAME  Checkpoint: best or last, default: best. The best one has the highest mean return over the seeds.
+  seed=N           Seed of the episode. Integer >= 0, default: 0.
+  train_seed=N     Seed of the run whose policy is shown. Integer, default: the first seed.
+  frames=N         Number of frames of .png and .gif. Integer >= 1, default: 6 for .png, 150 for .gif.
+  until=N          Last step of .png, .gif and .mp4. Integer >= 1, default: the end of the episode.
+  task.KEY=VALUE   Change a field of the task. The type is that of the field, default: the task of the run.
 
 examples
   jaxswarm-render runs/thesis
@@ -29,17 +47,17 @@ OPTIONS = ("out", "checkpoint", "seed", "train_seed", "frames", "until")
 
 @program
 def main(arguments: Sequence[str]) -> int:
-    """Plays policies and writes what was to be seen; returns the exit code."""
+    """Record episodes of policies and write them to a file; return the exit code."""
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
     paths, options, overrides = split_paths(arguments, OPTIONS)
     if not paths:
-        raise ConfigError("give at least one run folder: jaxswarm-render PATH [key=value ...]")
-    seed = whole("seed", options.get("seed", 0), 0)
-    sizes = {name: whole(name, options[name], 1) for name in ("frames", "until") if name in options}
+        raise ConfigError("PATH: must be at least one run folder, got none; use jaxswarm-render PATH... [key=value ...]")
+    seed = parse_integer("seed", options.get("seed", 0), 0)
+    sizes = {name: parse_integer(name, options[name], 1) for name in ("frames", "until") if name in options}
     pairs = configs.parse(overrides)
-    only_of_task(pairs, load(paths[0]), OPTIONS)
+    require_task_keys(pairs, load_config(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "replay.html"))
     use_compile_cache()
     from jaxswarm import render  # noqa: PLC0415
@@ -53,7 +71,7 @@ def main(arguments: Sequence[str]) -> int:
     except (ValueError, render.RenderError) as error:
         raise ConfigError(str(error)) from error
     except OSError as error:
-        raise ConfigError(f"cannot write {out}: {error.strerror}") from error
+        raise ConfigError(f"out: cannot write to {out}: {error.strerror}") from error
     for film in films:
         print(f"{film.title}: {film.num_frames - 1} steps, return {film.score[-1]:.2f}")
     print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
@@ -63,7 +81,7 @@ def main(arguments: Sequence[str]) -> int:
 def _film(
     run_dir: Path, pairs: Sequence[tuple[str, Any]], options: Mapping[str, str], seed: int, num_films: int
 ) -> Any:
-    """An episode of the policy of a run; `None` if it cannot be restored. All films together stay below the limit."""
+    """Record an episode of the policy of a run; return `None` if it cannot be restored. All films share `MAX_SHARES`."""
     found = policy_on_task(run_dir, pairs, options)
     if found is None:
         return None

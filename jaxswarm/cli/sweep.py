@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
-from jaxswarm.cli.program import command, program, split, use_compile_cache, wants_help, whole
+from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
 
 HELP = """\
@@ -16,14 +16,23 @@ jaxswarm-sweep key=a,b,c [key=1e-4..1e-3:5log] ... [num_seeds=N] [sweep_dir=PATH
 jaxswarm-sweep search=NAME [trials=N] [storage=PATH|URL] [key=value ...] [num_seeds=N] [sweep_dir=PATH]
 jaxswarm-sweep resume=PATH
 
-The first form trains every combination of the values, each in a run folder of its own: what is only a number side by
-side in one program, the rest one program after another. Ends with a table, summary.csv and curves.png.
+The first form trains every combination of the values, each in its own run folder. Combinations that differ in numbers
+only are vectorized in one compiled program; the others are trained one program after another. It ends with a table,
+summary.csv and curves.png.
 
-The second form searches with Optuna: configs/search/NAME.yaml, or a file, says what may be chosen. Trials are trained
-over num_seeds seeds; the mean return during training is maximized. Machines that name the same storage (a journal file
-that they share, or a database such as postgresql://user@host/name) work on the same search, each in its own sweep_dir.
+The second form searches with Optuna. configs/search/NAME.yaml, or a YAML file, defines the search space. Each trial is
+trained with num_seeds seeds, and the search maximizes the mean return during training. Machines that name the same
+storage (a shared journal file, or a database such as postgresql://user@host/name) work on the same search, each in its
+own sweep_dir.
 
-Ctrl-C or SIGTERM ends after a checkpoint; resume=PATH goes on from there.
+Ctrl-C or SIGTERM stops after a checkpoint; the third form resumes the sweep or the search.
+
+options
+  sweep_dir=PATH   Folder of the sweep (default: sweeps/ and the time).
+  search=NAME      Search space in configs/search, or the path of a YAML file.
+  trials=N         Number of trials of the whole search (default: 20).
+  storage=PATH     Journal file or database URL of the search (default: journal.log in sweep_dir).
+  resume=PATH      Folder of a sweep or a search to resume.
 
 examples
   jaxswarm-sweep learner.learning_rate=1e-4,3e-4,1e-3 aggregator=mean,bayesian num_seeds=8
@@ -31,12 +40,12 @@ examples
   jaxswarm-sweep search=thesis aggregator=bayesian trials=40 num_seeds=4 storage=shared/journal.log
 """
 OPTIONS = ("sweep_dir", "resume", "search", "trials", "storage")
-PLAN = "sweep.json"  # what was asked for, in the folder of the sweep
+PLAN = "sweep.json"  # file in the sweep folder with the options and overrides of its command
 
 
 @program
 def main(arguments: Sequence[str]) -> int:
-    """Sweeps, searches, or continues; returns the exit code."""
+    """Train a sweep or a search, or resume one; return the exit code."""
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
@@ -49,37 +58,37 @@ def main(arguments: Sequence[str]) -> int:
     else:
         sweep_dir = Path(options.pop("sweep_dir", "") or f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}")
         if sweep_dir.exists() and (not sweep_dir.is_dir() or any(sweep_dir.iterdir())):
-            raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; continue it with resume={sweep_dir}")
+            raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; resume it with resume={sweep_dir}")
     if "search" in options:
         return _search(sweep_dir, options, overrides)
     if options:
-        raise ConfigError(f"{next(iter(options))} has no meaning without search=NAME")
+        raise ConfigError(f"{next(iter(options))}: must be used with search=NAME")
     return _sweep(sweep_dir, overrides)
 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
     from jaxswarm.host import ensemble  # noqa: PLC0415
-    from jaxswarm.studies import grid as sweep  # noqa: PLC0415
-    from jaxswarm.studies.trials import train  # noqa: PLC0415
+    from jaxswarm.studies import grid  # noqa: PLC0415
+    from jaxswarm.studies.execution import train  # noqa: PLC0415
 
-    trials = sweep.trials(sweep.expand(overrides), sweep_dir)
-    programs = sweep.programs(trials)
+    runs = grid.runs(grid.expand(overrides), sweep_dir)
+    programs = grid.programs(runs)
     _save(sweep_dir, {}, overrides)
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
-    print(f"{_count(trials, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
+    print(f"{_count(runs, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
     for number, together in enumerate(programs):
         num_seeds = together[0].settings.num_seeds
-        names = ", ".join(trial.run_dir.name for trial in together)
+        names = ", ".join(run.folder.name for run in together)
         print(f"program {number + 1} of {len(programs)}: {names}; seeds of each: {num_seeds}", flush=True)
         is_finished, of_each = train(together)
         if not is_finished:
-            print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
+            print(f"stopped; resume with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return 0
-        rows |= {trial.run_dir: x for trial, x in zip(together, of_each, strict=True)}
-    table = sweep.summary(trials, [rows[trial.run_dir] for trial in trials])
-    sweep.write_summary(sweep_dir / "summary.csv", table)
+        rows |= {run.run_dir: x for run, x in zip(together, of_each, strict=True)}
+    table = grid.summary(runs, [rows[run.run_dir] for run in runs])
+    grid.write_summary(sweep_dir / "summary.csv", table)
     for line in table:
         spread = f"{line['median']:10.2f} [{line['q25']:.2f}, {line['q75']:.2f}]"
         note = f", {line['diverged']} diverged" if line["diverged"] else ""
@@ -89,13 +98,14 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
     from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.host.run import Run  # noqa: PLC0415
     from jaxswarm.studies import search  # noqa: PLC0415
-    from jaxswarm.studies.trials import Trial, train  # noqa: PLC0415
+    from jaxswarm.studies.execution import train  # noqa: PLC0415
 
     pairs = configs.parse(overrides)
     config = configs.compose_pairs(pairs)
     space = search.load_space(options["search"], config)
-    num_trials = whole("trials", options.get("trials", 20), 1)
+    num_trials = parse_integer("trials", options.get("trials", 20), 1)
     _save(sweep_dir, options, overrides)
     use_compile_cache()
     ensemble.use_cores(config["num_seeds"])
@@ -107,13 +117,13 @@ def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) 
         asked.set_user_attr(search.RUN_DIR, str(run_dir))
         of_trial = search.suggest(asked, space, pairs)
         print(f"trial {asked.number}: {json.dumps(asked.params)}", flush=True)
-        one = Trial(of_trial, configs.build(of_trial), run_dir)
-        is_finished, (rows,) = train([one])
+        run = Run.from_config(of_trial, run_dir)
+        is_finished, (rows,) = train([run])
         if not is_finished:
             search.requeue(study, asked.number)
-            print(f"stopped; continue with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
+            print(f"stopped; resume with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return 0
-        search.tell(study, asked, search.value(rows, one.settings.seeds, one.num_evaluations))
+        search.tell(study, asked, search.value(rows, run.seeds, run.num_evaluations))
     done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
     for trial in sorted(done, key=lambda trial: trial.value or 0.0, reverse=True)[:5]:
         print(f"{trial.value:10.2f}  {trial.user_attrs[search.RUN_DIR]}  {json.dumps(trial.params)}")
@@ -129,7 +139,7 @@ def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) ->
 
     try:
         sweep_dir.mkdir(parents=True, exist_ok=True)
-        replace_text(sweep_dir / PLAN, json.dumps({"options": options, "words": list(overrides)}, indent=2) + "\n")
+        replace_text(sweep_dir / PLAN, json.dumps({"options": options, "overrides": list(overrides)}, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"cannot write to {sweep_dir}: {error.strerror}") from error
 
@@ -137,6 +147,6 @@ def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) ->
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
     try:
         plan = json.loads((sweep_dir / PLAN).read_text())
-        return plan["options"], plan["words"]
+        return plan["options"], plan["overrides" if "overrides" in plan else "words"]  # words: version 0.1
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no {PLAN}") from error

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.cli.policy_options import load_policies
+from jaxswarm.cli.policy_options import restore_policies
 from jaxswarm.cli.program import (
     command,
     join_processes,
-    load,
-    only,
+    load_config,
     program,
+    require_keys,
     resume_command,
     split,
     use_compile_cache,
@@ -29,9 +29,9 @@ jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
 jaxswarm-train [group=choice] ... --help
 
 Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, replay.html, checkpoints.
-Ctrl-C or SIGTERM ends it after a checkpoint; resume=PATH continues it exactly where its last checkpoint stands.
-Several processes, on one machine or more, train together if each runs the same command with JAX_COORDINATOR_ADDRESS,
-JAX_NUM_PROCESSES and JAX_PROCESS_ID set; the first one writes.
+Ctrl-C or SIGTERM stops after a checkpoint. resume=PATH continues that run exactly from its last checkpoint.
+Several processes, on one or more machines, train together if each runs the same command with JAX_COORDINATOR_ADDRESS,
+JAX_NUM_PROCESSES and JAX_PROCESS_ID set. The first process writes the files.
 
 examples
   jaxswarm-train
@@ -45,7 +45,7 @@ examples
 
 @program
 def main(arguments: Sequence[str]) -> int:
-    """Trains, or continues a run; returns the exit code."""
+    """Train or resume a run; return the exit code."""
     if wants_help(arguments):
         print(HELP + "\n" + _keys_help([word for word in arguments if "=" in word]))
         return 0
@@ -59,20 +59,20 @@ def _train(arguments: Sequence[str], is_first: bool) -> int:
     paths, overrides = split(arguments, ("run_dir", "resume"))
     if "resume" in paths:
         if "run_dir" in paths:
-            raise ConfigError("give one of run_dir and resume")
+            raise ConfigError("give only one of run_dir and resume")
         return _resume(Path(paths["resume"]), overrides, is_first)
     config = configs.compose(overrides)
     run_dir = Path(paths.get("run_dir") or _default_run_dir(config))
     if is_first and run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
-        hint = f"continue it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
+        hint = f"resume it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
         raise ConfigError(f"run_dir={run_dir} exists and is not empty; {hint}, or choose another folder")
     return _fit(config, run_dir, is_resumed=False, is_first=is_first)
 
 
 def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
-    config = load(run_dir)
+    config = load_config(run_dir)
     pairs = configs.parse(overrides)
-    only(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
+    require_keys(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
     extended = configs.override(config, pairs)
     if pairs:
         per_update = configs.build(config).agent_steps_per_update
@@ -84,53 +84,45 @@ def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
 
 
 def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int:
-    run, experiment = configs.run_settings(config), configs.build(config)
-    num_updates = run.length(experiment.agent_steps_per_update)
     use_compile_cache()
-    from jaxswarm import render  # noqa: PLC0415
     from jaxswarm.host import ensemble  # noqa: PLC0415
-    from jaxswarm.host import trained as policies  # noqa: PLC0415
     from jaxswarm.host.checkpoint import CheckpointError  # noqa: PLC0415
-    from jaxswarm.host.fit import DivergedError, fit  # noqa: PLC0415
+    from jaxswarm.host.fit import DivergedError, fit_runs  # noqa: PLC0415
+    from jaxswarm.host.run import Run  # noqa: PLC0415
 
-    ensemble.use_cores(run.num_seeds)
-    params = policies.warm_start(run, run_dir)
-    print(_summary(config, experiment, num_updates, run_dir), flush=True)
+    run = Run.from_config(config, run_dir)
+    ensemble.use_cores(run.settings.num_seeds)
+    print(_summary(config, run), flush=True)
     try:
-        train_state, rows = fit(
-            experiment,
-            num_updates,
-            seed=run.seed,
-            num_seeds=run.num_seeds,
-            run_dir=run_dir,
-            resume=is_resumed,
-            checkpoint_seconds=run.checkpoint_seconds,
-            keep_checkpoints=run.keep_checkpoints,
-            log_to=run.loggers,
-            config=config,
-            on_evaluation=render.hook(run_dir, experiment, run.render_every) if run.render_every else None,
-            init_params=params,
-        )
+        train_state, (rows,) = fit_runs([run], resume=is_resumed)
     except (DivergedError, CheckpointError) as error:
         print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
         return 1
     update = int(train_state.update.max())
-    if update < num_updates:
-        print(f"stopped after update {update} of {num_updates}; continue with: {resume_command(run_dir)}")
+    if update < run.num_updates:
+        print(f"stopped after update {update} of {run.num_updates}; resume with: {resume_command(run_dir)}")
         return 0
     if is_first:
-        found = load_policies(run_dir, config, "last", run.seeds[:1])
-        assert found
-        render.write_replay(run_dir, experiment, render.of_seed(found.params, 0), update=update)
+        _write_replay(config, run, update)
     if rows:
         first, last = (_return_at(rows, rows[index]["update"]) for index in (0, -1))
-        print(f"done: {update} updates, return {last} ({'at first' if run.init_from else 'untrained'} {first})")
+        start = "warm start" if run.settings.init_from else "untrained"
+        print(f"done: {update} updates, return {last} ({start} {first})")
     print(f"{_files(run_dir)}\nnext: {command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
     return 0
 
 
+def _write_replay(config: Config, run: Any, update: int) -> None:
+    """Write a replay of the final policy of the first seed."""
+    from jaxswarm import render  # noqa: PLC0415
+
+    found = restore_policies(run.folder, config, "last", run.seeds[:1])
+    assert found
+    render.write_replay(run.folder, run.experiment, render.of_seed(found.params, 0), update=update)
+
+
 def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
-    """The return of an evaluation; of several seeds the median and the quartiles."""
+    """Format the return of an evaluation; for several seeds, the median and the quartiles."""
     import numpy as np  # noqa: PLC0415
 
     returns = [row["eval/return"] for row in rows if row["update"] == update]
@@ -182,24 +174,23 @@ def _default_run_dir(config: Config) -> str:
     return path
 
 
-def _summary(config: Config, experiment: Any, num_updates: int, run_dir: Path) -> str:
+def _summary(config: Config, run: Any) -> str:
     names = ", ".join(config[part]["name"] for part in ("task", "aggregator", "learner"))
-    per_update = experiment.agent_steps_per_update
-    seeds = configs.run_settings(config).seeds
-    seeds = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]} side by side"
+    num_updates, per_update, seeds = run.num_updates, run.experiment.agent_steps_per_update, run.seeds
+    seeds = f"seed {seeds[0]}" if len(seeds) == 1 else f"vectorized seeds {seeds[0]} to {seeds[-1]}"
     return (
-        f"{names}: {experiment.task.num_agents} agents, {num_updates} updates of {per_update:,} agent steps "
-        f"({num_updates * per_update:,} in all), {seeds}\nrun folder: {run_dir}"
+        f"{names}: {run.experiment.task.num_agents} agents, {num_updates} updates of {per_update:,} agent steps "
+        f"({num_updates * per_update:,} in total), {seeds}\nrun folder: {run.run_dir}"
     )
 
 
 def _files(run_dir: Path) -> str:
     about = {
         "curve.png": "learning curve",
-        "replay.html": "an episode of the last policy: open it in a browser",
-        "metrics.csv": "a row per evaluation",
-        "checkpoints": "the latest and the best state",
-        "config.yaml": "what was asked for",
+        "replay.html": "an episode of the final policy; open it in a browser",
+        "metrics.csv": "a row per evaluation and seed",
+        "checkpoints": "the latest and the best training state",
+        "config.yaml": "all settings of the run",
         "manifest.json": "versions, device, exact numbers of steps",
     }
     return "\n".join(f"  {run_dir / name!s:<50} {text}" for name, text in about.items() if (run_dir / name).exists())

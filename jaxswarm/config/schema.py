@@ -1,4 +1,4 @@
-"""What constructors take, read off their signatures, and whether a value that a user wrote is of such a type."""
+"""Constructor parameters: their types, defaults and descriptions, and checks of values against the types."""
 
 import difflib
 import inspect
@@ -9,11 +9,11 @@ from typing import Any
 
 
 class ConfigError(ValueError):
-    """Something the user wrote is not possible; the message says what would be."""
+    """A value or key that the user gave is invalid; the message names it and says what is valid."""
 
 
 def parameters(cls: Any) -> dict[str, inspect.Parameter]:
-    """Constructor parameters with resolved annotations; what flax adds to modules is left out."""
+    """Return the constructor parameters of a class with resolved annotations, without those that flax adds."""
     hints = typing.get_type_hints(cls)
     is_module = hasattr(cls, "module_paths")
     return {
@@ -23,10 +23,27 @@ def parameters(cls: Any) -> dict[str, inspect.Parameter]:
     }
 
 
-def check(value: Any, annotation: Any, name: str) -> Any:
-    """The value as that type; integers pass for floats, nothing else passes for anything else.
+def descriptions(cls: type) -> dict[str, str]:
+    """Return the description of each field: the `Attributes:` sections (Google style) of the class and its bases."""
+    from docstring_parser import DocstringStyle, parse  # noqa: PLC0415
 
-    A `ConfigError` calls the value by this name and says which types would pass.
+    found = {}
+    for owner in reversed(cls.__mro__):
+        fields = parse(owner.__doc__ or "", style=DocstringStyle.GOOGLE).params
+        found |= {field.arg_name: " ".join((field.description or "").split()) for field in fields}
+    return found
+
+
+def summary(cls: type) -> str:
+    """Return the first paragraph of the docstring of a class in one line; empty without a docstring."""
+    return " ".join((vars(cls).get("__doc__") or "").partition("\n\n")[0].split())
+
+
+def check(value: Any, annotation: Any, name: str) -> Any:
+    """Return the value if it has the annotated type; an integer is converted where a float is expected.
+
+    Lists are returned as lists, also for annotations of tuples. Integers in lists are sizes and must be >= 1.
+    Raises a `ConfigError` that calls the value `name` and lists the valid types.
     """
     for accepted in _members(annotation):
         if accepted is float and isinstance(value, int | float) and type(value) is not bool and math.isfinite(value):
@@ -38,7 +55,7 @@ def check(value: Any, annotation: Any, name: str) -> Any:
         if typing.get_origin(accepted) is tuple and isinstance(value, list | tuple):
             element = typing.get_args(accepted)[0]
             elements = [check(x, element, f"{name}[{i}]") for i, x in enumerate(value)]
-            if element is not int or min(elements, default=1) >= 1:  # integers in lists are sizes
+            if element is not int or min(elements, default=1) >= 1:
                 return elements
     hint = f" (write {int(value)})" if isinstance(value, float) and value.is_integer() else ""
     raise ConfigError(f"{name}: must be {_describe(annotation)}, got {value!r}{hint}")
@@ -67,6 +84,6 @@ def _describe(annotation: Any) -> str:
 
 
 def nearest(word: str, accepted: list[str]) -> str:
-    """Suggestion of the most similar word, to be appended to a message; empty if no word is similar."""
+    """Return a suggestion of the most similar accepted word, to append to a message; empty if none is similar."""
     near = difflib.get_close_matches(word, accepted, n=1, cutoff=0.5 if "." not in word else 0.3)
     return f" (did you mean {near[0]!r}?)" if near else ""

@@ -1,4 +1,4 @@
-"""Trained policies as files that run without jaxswarm."""
+"""Export of trained policies to files that run without jaxswarm."""
 
 from jaxswarm.export.program import PLATFORMS, export_policy
 

@@ -1,7 +1,7 @@
-"""Claims about learning curves: a number that follows from them, and the range in which it has to be.
+"""Claims about learning curves: a number computed from the curves, and the range in which it must be.
 
-Curves are medians over seeds, measured as the thesis measured its own, and the same number is computed of both. How
-certain a number is follows from redrawing the seeds (bootstrap): a verdict takes that nine of ten redrawings agree.
+The curves are medians over seeds, measured as in the thesis. The same number is computed from our curves and from those
+of the thesis. Bootstrap resamples of the seeds estimate the certainty: a verdict requires that at least 90 % agree.
 """
 
 import dataclasses
@@ -12,50 +12,53 @@ import numpy as np
 
 from jaxswarm.analysis.curves import Line, Points
 
-LAST = 0.1  # share of a curve that makes up its final level
-SMOOTHED = 5  # evaluations, centered, before it is asked when a curve reaches a level
+LAST = 0.1  # share of a curve, at its end, whose mean is the final level
+SMOOTHED = 5  # evaluations of the centered mean that smooths a curve
 TOLERANCE = 1e-3  # share of a curve that may be missing at its end
-CERTAINTY = 0.9  # share of redrawings that have to agree
+CERTAINTY = 0.9  # share of bootstrap resamples that must agree
 
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """A series; `reference` is the curve to compare with, which says where it ends and what its levels are."""
+    """Curve of a series. `reference` is the curve that it is compared with, whose levels define `steps_to`."""
 
     line: Line
     reference: Line
-    end: float  # agent steps where the last tenth is over
-    bootstrapped: tuple[Line, ...] = ()  # the same of seeds drawn from these, with replacement
+    end: float  # agent steps at which the last tenth, the final level, ends
+    bootstrapped: tuple[Line, ...] = ()  # the line of each bootstrap resample of the seeds
 
     @property
     def is_cut(self) -> bool:
-        """Whether the series ends before it should."""
+        """Whether the series ends before `end`."""
         return self.is_cut_before(self.end)
 
     @property
     def num_seeds(self) -> int:
-        """Those that have reached the end."""
+        """Number of seeds that have reached the end."""
         return self.num_seeds_at(self.end)
 
     def is_cut_before(self, steps: float) -> bool:
-        """Whether the series ends before so many agent steps."""
+        """Return whether the series ends before `steps` agent steps."""
         return bool(self.line.x[-1] < (1 - TOLERANCE) * steps)
 
     def num_seeds_at(self, steps: float) -> int:
-        """Those that have come so far."""
+        """Return the number of seeds that have reached `steps` agent steps."""
         return int(np.interp(steps, self.line.x, self.line.num_seeds))
 
     def final(self, values: Points | None = None) -> float:
-        """Mean over the last tenth: of the median, or of a quartile."""
+        """Return the final level: the mean over the last tenth of the median, or of `values` such as a quartile."""
         values = self.line.y if values is None else values
         return _final(self.line.x, values, self.end)
 
     def at(self, steps: float) -> float:
-        """The smoothed median after so many agent steps, NaN beyond its end."""
+        """Return the smoothed median after `steps` agent steps; NaN beyond its end."""
         return float(np.interp(steps, self.line.x, _smooth(self.line.y), right=math.nan))
 
     def steps_to(self, fraction: float) -> float:
-        """Agent steps to this share of the reference's way from its start to its final level; NaN if never."""
+        """Return the agent steps until the smoothed median reaches a level; NaN if it never does.
+
+        The level is `fraction` of the way from the start to the final level of the reference.
+        """
         start, final = self.reference.y[0], _final(self.reference.x, self.reference.y, self.reference.x[-1])
         reached = np.flatnonzero(_smooth(self.line.y) >= start + fraction * (final - start))
         return float(self.line.x[reached[0]]) if reached.size else math.nan
@@ -63,51 +66,58 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A sentence, and the number that decides it: of a kind of `KINDS`, for these series, from `low` to `high`."""
+    """Claim about series: the sentence `says`, which holds if a number of a kind in `KINDS` is in [`low`, `high`]."""
 
     says: str
     kind: str
     series: tuple[str, ...]
     low: float = -math.inf
     high: float = math.inf
-    at: float = math.nan  # agent steps, of the kinds that ask for a point
-    fraction: float = math.nan  # of the way to the final level, of the kinds that ask when
+    at: float = math.nan  # agent steps, for the kinds level and lead
+    fraction: float = math.nan  # of the way to the final level, for the kinds steps and pace
 
     def number(self, series: Mapping[str, Measured]) -> float:
-        """What the claim is about; NaN if not known, of `pace` infinite or 0 where one series never gets there."""
+        """Return the number of the claim; NaN if it is unknown.
+
+        The number of `pace` is infinite or 0 if one of the two series never reaches the level.
+        """
         return KINDS[self.kind](self, [series[name] for name in self.series])
 
     def needs(self, one: Measured) -> float:
-        """Up to how many agent steps the claim looks at a series."""
+        """Return the agent steps up to which the claim needs a series."""
         if not math.isnan(self.at):
             return self.at
         reached = math.nan if math.isnan(self.fraction) else one.steps_to(self.fraction)
         return one.end if math.isnan(reached) else reached
 
     def holds(self, number: float) -> bool:
-        """Whether it is in the range; NaN never is."""
+        """Return whether the number is in the range; NaN never is."""
         return bool(self.low <= number <= self.high)
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What became of a claim, with the number here and in the thesis; NaN where there is none."""
+    """Outcome of a claim, with its number in our curves and in the thesis; NaN if a number is unknown."""
 
     claim: Claim
     outcome: str  # reproduced, not reproduced, not enough runs, run was cut
     here: float
     thesis: float
     num_seeds: int
-    interval: tuple[float, float] = (math.nan, math.nan)  # of the number here, in four of five redrawings
+    interval: tuple[float, float] = (math.nan, math.nan)  # 80 % bootstrap interval of the number here
 
 
 def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measured], enough: int) -> Verdict:
-    """The verdict, which takes `enough` seeds of every series, trained as far as the claim looks, that agree."""
+    """Return the verdict on a claim.
+
+    It requires `enough` seeds of every series, trained up to the step that the claim needs, and a share `CERTAINTY` of
+    the bootstrap resamples that agree.
+    """
     thesis = claim.number(theirs) if theirs.keys() >= set(claim.series) else math.nan
     if not ours.keys() >= set(claim.series):
         return Verdict(claim, "not enough runs", math.nan, thesis, 0)
     series = [ours[name] for name in claim.series]
-    here, bootstrapped = claim.number(ours), _redrawn(claim, ours)
+    here, bootstrapped = claim.number(ours), _bootstrapped_numbers(claim, ours)
     num_seeds = min(one.num_seeds_at(claim.needs(one)) for one in series)
     if any(one.is_cut_before(claim.needs(one)) for one in series):
         outcome = "run was cut"
@@ -117,21 +127,21 @@ def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measu
         outcome = "not enough runs"
     else:
         outcome = "reproduced" if claim.holds(here) else "not reproduced"
-    numbers = np.nan_to_num(bootstrapped, nan=math.inf, posinf=math.inf)  # steps to where it never gets
+    numbers = np.nan_to_num(bootstrapped, nan=math.inf, posinf=math.inf)  # NaN: the level is never reached
     low, high = np.percentile(numbers, [10, 90], method="nearest") if bootstrapped else (math.nan, math.nan)
     return Verdict(claim, outcome, here, thesis, num_seeds, (float(low), float(high)))
 
 
-def _redrawn(claim: Claim, series: Mapping[str, Measured]) -> list[float]:
-    """The claim's number in every redrawing of the seeds of all its series."""
+def _bootstrapped_numbers(claim: Claim, series: Mapping[str, Measured]) -> list[float]:
+    """Return the claim's number for each bootstrap resample of the seeds of all its series."""
     count = min(len(series[name].bootstrapped) for name in claim.series)
 
-    def draw(number: int) -> dict[str, Measured]:
+    def resample(number: int) -> dict[str, Measured]:
         return {
             name: dataclasses.replace(series[name], line=series[name].bootstrapped[number]) for name in claim.series
         }
 
-    return [claim.number(draw(number)) for number in range(count)]
+    return [claim.number(resample(number)) for number in range(count)]
 
 
 def _final(x: Points, values: Points, end: float) -> float:
@@ -140,7 +150,7 @@ def _final(x: Points, values: Points, end: float) -> float:
 
 
 def _smooth(values: Points) -> Points:
-    """Centered means; at the ends the first and the last value count for those that would be beyond."""
+    """Return centered means over `SMOOTHED` values; beyond the ends, the first and the last value are repeated."""
     padded = np.pad(values, SMOOTHED // 2, mode="edge")
     return np.convolve(padded, np.full(SMOOTHED, 1 / SMOOTHED), mode="valid")
 
@@ -165,19 +175,19 @@ def _lead(claim: Claim, series: Sequence[Measured]) -> float:
 
 def _pace(claim: Claim, series: Sequence[Measured]) -> float:
     steps = [one.steps_to(claim.fraction) for one in series]
-    is_never = [math.isnan(x) and not one.is_cut for x, one in zip(steps, series, strict=True)]
-    first, second = np.where(is_never, math.inf, steps).tolist()
+    is_never_reached = [math.isnan(x) and not one.is_cut for x, one in zip(steps, series, strict=True)]
+    first, second = np.where(is_never_reached, math.inf, steps).tolist()
     return first / second  # NaN if both are infinite
 
 
 KINDS: dict[str, Callable[[Claim, Sequence[Measured]], float]] = {
-    "final": lambda _, series: series[0].final(),  # the final level
-    "lower_quartile": lambda _, series: series[0].final(series[0].line.lower),  # of the final level
-    "difference": lambda _, series: series[0].final() - series[1].final(),  # of two final levels
-    "spread": _spread,  # between the highest and the lowest final level
-    "overlap": _overlap,  # of what lies between the quartiles of the final levels
-    "level": lambda claim, series: min(one.at(claim.at) for one in series),  # the lowest of the series, at a point
-    "lead": _lead,  # at a point, of the first series over the best of the others
-    "steps": lambda claim, series: series[0].steps_to(claim.fraction),  # to a fraction of the way
-    "pace": _pace,  # the steps of the first series over those of the second
+    "final": lambda _, series: series[0].final(),  # final level
+    "lower_quartile": lambda _, series: series[0].final(series[0].line.lower),  # lower quartile of the final level
+    "difference": lambda _, series: series[0].final() - series[1].final(),  # first minus second final level
+    "spread": _spread,  # highest minus lowest final level
+    "overlap": _overlap,  # width of the overlap of the interquartile ranges of the final levels
+    "level": lambda claim, series: min(one.at(claim.at) for one in series),  # lowest of the series at a step
+    "lead": _lead,  # first series minus the best of the others at a step
+    "steps": lambda claim, series: series[0].steps_to(claim.fraction),  # agent steps to a fraction of the way
+    "pace": _pace,  # agent steps of the first series divided by those of the second
 }

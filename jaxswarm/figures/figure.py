@@ -1,7 +1,7 @@
-"""The figures of the thesis: what was run for them, its curves, and what these show.
+"""The figures of the thesis: their runs, the published curves, and their claims.
 
-A figure is a file in `configs/figure`: its series as words for `jaxswarm-train`, and its claims. Series that are the
-same experiment share a run folder, whichever figures they are in.
+A figure is a file in `configs/figure`: its series as overrides for `jaxswarm-train`, and its claims. Series of the same
+experiment share a run folder, also across figures.
 """
 
 import dataclasses
@@ -16,55 +16,54 @@ import numpy as np
 
 from jaxswarm import config as configs
 from jaxswarm import files
-from jaxswarm.analysis import curves, plots
-from jaxswarm.analysis import run_folders as runs
+from jaxswarm.analysis import curves, plots, run_folders
 from jaxswarm.analysis.curves import Line
-from jaxswarm.analysis.plots import Picture, Series
+from jaxswarm.analysis.plots import Plot, Series
 from jaxswarm.analysis.run_folders import RunFolder
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.figures import claims
 from jaxswarm.figures.claims import Claim, Measured, Verdict
 from jaxswarm.files import RETURN, replace_text
-from jaxswarm.studies.trials import Trial
+from jaxswarm.host.run import Run
 
 CURVES = Path(__file__).resolve().parent.parent / "data" / "curves"  # of the thesis
 FRACTIONS = (0.5, 0.9, 0.95)  # of the way to the final level, in tables
 KEPT_OF_MANIFEST = ("started", "versions", "platform", "device", "git_revision")
 KEPT_OF_ROWS = ("update", "agent_steps", "wall_seconds", "seed", RETURN)
-NUM_BOOTSTRAP = 200  # times that seeds are redrawn, to see how certain a claim is
+NUM_BOOTSTRAP = 200  # bootstrap resamples of the seeds, for the certainty of a claim
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """What a figure's file says, and the curves of the thesis by the names of the series, which may be none.
+    """The content of a figure's file, and the curves of the thesis by the names of our series (possibly none).
 
-    Figures of the thesis name their series as it does; others say by `thesis` beside which of its series each is.
+    Figures of the thesis use its names for the series; other figures map their names to those of the thesis.
     """
 
     name: str
     title: str
-    series: Mapping[str, tuple[str, ...]]  # words for `configs.compose`
+    series: Mapping[str, tuple[str, ...]]  # overrides for `configs.compose`
     claims: tuple[Claim, ...]
     references: Mapping[str, Line]
-    thesis: Mapping[str, str]  # names of the references there
-    num_updates: int  # shown; the thesis trained some series for longer
-    num_seeds: int  # of each series, from which on there is a verdict
-    best_share: float  # of the seeds, which is shown: those with the highest means over their curves
-    y: tuple[str, ...]  # the pictures, linear and log
+    thesis: Mapping[str, str]  # name of the reference of each series
+    num_updates: int  # length shown; the thesis trained some series for longer
+    num_seeds: int  # seeds of each series that a verdict needs
+    best_share: float  # share of the seeds that is shown: those with the highest means over their curves
+    y: tuple[str, ...]  # scales of the plots: linear, log
 
     @property
     def num_shown(self) -> int:
-        """Seeds of a series that are shown, of those from which on there is a verdict."""
+        """Number of seeds of a series that are shown, if there are as many as a verdict needs."""
         return curves.num_best(self.num_seeds, self.best_share)
 
     @property
     def pictures(self) -> dict[str, str]:
-        """File names, and logarithmic axes."""
+        """File names of the plots, each with its logarithmic axes."""
         return {self.name if scale == "linear" else f"{self.name}_{scale}": "y" * (scale == "log") for scale in self.y}
 
 
 def names() -> list[str]:
-    """All figures, in the order of the thesis, then our own."""
+    """Return the names of all figures: those of the thesis in its order, then our own."""
     found = (path.stem for path in (configs.config_dir() / configs.FIGURES).glob("*.yaml"))
 
     def place(name: str) -> tuple:
@@ -74,8 +73,8 @@ def names() -> list[str]:
     return sorted(found, key=place)
 
 
-def load(name: str) -> Figure:
-    """The figure of this name; a `ConfigError` lists those that there are."""
+def load_figure(name: str) -> Figure:
+    """Load the figure of this name; a `ConfigError` lists the valid names."""
     if name not in names():
         raise ConfigError(f"figure: must be one of all, {', '.join(names())}, got {name!r}")
     fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
@@ -90,18 +89,18 @@ def load(name: str) -> Figure:
     return Figure(name=name, references=references, thesis=thesis, **fields)
 
 
-def stored(*directories: Path) -> list[RunFolder]:
-    """All runs in the directories, of any figure; of folders with the same name the longest one."""
+def find_runs(*directories: Path) -> list[RunFolder]:
+    """Find all runs in the directories, of any figure; among folders of the same name, the longest run."""
     found: dict[str, RunFolder] = {}
     for directory in directories:
         for config in sorted(directory.glob("*/config.yaml")):
-            folder = runs.read(config.parent)
+            folder = run_folders.read(config.parent)
             found[folder.path.name] = max(found.get(folder.path.name, folder), folder, key=lambda one: len(one.rows))
     return list(found.values())
 
 
-def keep(folder: RunFolder, directory: Path) -> None:
-    """Copies the little that reports read of a run: config, evaluations, and where it was trained by what code."""
+def keep_results(folder: RunFolder, directory: Path) -> None:
+    """Copy what reports need of a run: config, evaluations, and the versions and the device of its training."""
     kept = directory / folder.path.name
     if kept.resolve() == folder.path.resolve():
         return
@@ -120,76 +119,79 @@ def plan(
     num_seeds: int | None = None,
     scale: float = 1.0,
     overrides: Sequence[str] = (),
-) -> dict[str, list[Trial]]:
-    """The trials of each series: those in folders that were found to hold some of its seeds, and new ones for the rest.
+) -> dict[str, list[Run]]:
+    """Return the runs of each series: folders that already hold some of its seeds, and new folders for the rest.
 
-    They are `scale` times as long as what the figure shows of it; `words` change all series.
+    Runs have `scale` times the length that the figure shows; `overrides` apply to all series.
     """
     wanted = {
         series: _cut(figure, [*own, *overrides], num_seeds or figure.num_seeds, scale)
         for series, own in figure.series.items()
     }
-    return {series: _trials(config, directory, found) for series, config in wanted.items()}
+    return {series: _runs(config, directory, found) for series, config in wanted.items()}
 
 
-def is_finished(trial: Trial) -> bool:
-    """Whether its folder has been trained for as long, or longer for another figure."""
-    path = trial.run_dir / "metrics.csv"
-    rows = files.read_rows(path) if path.exists() else []
-    return any(row["update"] >= trial.num_updates for row in rows)
+def is_finished(run: Run) -> bool:
+    """Return whether the run's folder has been trained for at least the run's length."""
+    rows = files.read_rows(run.folder / "metrics.csv")
+    return any(row["update"] >= run.num_updates for row in rows)
 
 
 def measure(
-    figure: Figure, trials: Mapping[str, Sequence[Trial]], found: Sequence[RunFolder], warn: Callable[[str], object]
+    figure: Figure, runs: Mapping[str, Sequence[Run]], found: Sequence[RunFolder], warn: Callable[[str], object]
 ) -> dict[str, Measured]:
-    """What all seeds of the figure's series came to that any run holds; series without any are left out.
+    """Measure each series of the figure over all seeds found in any run; series without seeds are left out.
 
-    As in the thesis, an evaluation counts as after the update that follows it, so the untrained policy is not at 0.
+    As in the thesis, an evaluation is placed after the update that follows it, so the untrained policy is not at 0.
     """
     measured, generator = {}, np.random.default_rng(0)
-    for series, (trial, *_) in trials.items():
-        per_update = trial.experiment.agent_steps_per_update
+    for series, (run, *_) in runs.items():
+        per_update = run.experiment.agent_steps_per_update
         end = float(figure.num_updates * per_update)
-        same = [folder for folder in found if is_of(folder, trial.config)]
-        seeds = runs.seeds(same, "agent_steps", RETURN, warn, once=True) if any(folder.rows for folder in same) else []
+        same = [folder for folder in found if matches(folder, run.config)]
+        seeds = (
+            run_folders.seeds(same, "agent_steps", RETURN, warn, once=True)
+            if any(folder.rows for folder in same)
+            else []
+        )
         if seeds:
             shifted = [dataclasses.replace(seed, x=seed.x + per_update) for seed in seeds]
-            line = _until(curves.summarize(shifted, "median", figure.best_share), end)
+            line = _cut_line(curves.summarize(shifted, "median", figure.best_share), end)
             bootstrapped = curves.bootstrapped(shifted, "median", NUM_BOOTSTRAP, generator, figure.best_share)
-            bootstrapped = tuple(_until(one, end) for one in bootstrapped)
+            bootstrapped = tuple(_cut_line(one, end) for one in bootstrapped)
             reference = figure.references.get(series)
             end = min(end, float(reference.x[-1])) if reference else end
             measured[series] = Measured(line, reference or line, end, bootstrapped)
     return measured
 
 
-def is_of(folder: RunFolder, config: Config) -> bool:
-    """Whether a folder's runs are those of the config, but for their seeds and length."""
-    if folder.config != runs.fields(config):
+def matches(folder: RunFolder, config: Mapping[str, Any] | None) -> bool:
+    """Return whether a folder holds the config's experiment, whatever its seeds and length."""
+    if config is None or folder.config != run_folders.fields(dict(config)):
         return False
     return configs.read(folder.path / "config.yaml").get("eval_every") == config["eval_every"]
 
 
 def origin(folder: RunFolder) -> tuple[str, str]:
-    """On what device it was trained, and by what revision of the code, in its last session."""
+    """Return the device and the revision of the code of a run's last session."""
     manifest = _manifest(folder)
     device = manifest.get("device", {}).get("backend", "unknown devices")
     return device, (manifest.get("git_revision") or "unknown")[:12]
 
 
-def of_thesis(figure: Figure) -> dict[str, Measured]:
-    """The curves of the thesis, measured as ours are."""
+def thesis_measured(figure: Figure) -> dict[str, Measured]:
+    """Return the curves of the thesis, measured in the same way as ours."""
     return {name: Measured(line, line, float(line.x[-1])) for name, line in figure.references.items()}
 
 
 def verdicts(figure: Figure, measured: Mapping[str, Measured]) -> list[Verdict]:
-    """One for each claim."""
-    theirs = of_thesis(figure)
+    """Return the verdict on each claim of the figure."""
+    theirs = thesis_measured(figure)
     return [claims.judge(claim, measured, theirs, figure.num_shown) for claim in figure.claims]
 
 
-def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
-    """Draws the figure with the curves of the thesis behind ours, and writes the points beside; returns the files."""
+def plot_figure(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
+    """Plot the figure with the curves of the thesis overlaid, write its points as CSV, and return all files."""
     counts = {name: plots.seed_count(int(ours.line.num_seeds.max())) for name, ours in measured.items()}
     series = [Series(name, ours.line, counts[name]) for name, ours in measured.items()]
     for name, line in figure.references.items():
@@ -198,14 +200,14 @@ def draw(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Pa
     seeds = "seeds" if figure.best_share == 1 else f"the best {figure.best_share:.0%} of the seeds"
     caption = f"Median and quartiles over {seeds}" + ("; dashed: the thesis" if figure.references else "")
     out.mkdir(parents=True, exist_ok=True)
-    files = []
+    written = []
     for name, log in figure.pictures.items():
         label = "return of an episode"
-        picture = Picture("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
+        picture = Plot("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
         plots.draw(out / f"{name}.png", picture)
         replace_text(out / f"{figure.name}.csv", plots.table(picture))
-        files.append(out / f"{name}.png")
-    return [*files, out / f"{figure.name}.csv"]
+        written.append(out / f"{name}.png")
+    return [*written, out / f"{figure.name}.csv"]
 
 
 def _manifest(folder: RunFolder) -> dict[str, Any]:
@@ -226,22 +228,21 @@ def _cut(figure: Figure, overrides: Sequence[str], num_seeds: int, scale: float)
     return configs.override(config, [("num_updates", num_updates), ("num_seeds", num_seeds)])
 
 
-def _trials(config: Config, directory: Path, found: Sequence[RunFolder]) -> list[Trial]:
-    """Folders that hold seeds which no larger one holds, then a new folder for each range of seeds that none does."""
+def _runs(config: Config, directory: Path, found: Sequence[RunFolder]) -> list[Run]:
+    """Return runs for all seeds: folders that hold seeds which no larger folder holds, then new folders."""
     experiment, missing = configs.build(config), set(configs.run_settings(config).seeds)
     held = {
         folder.path: configs.run_settings(configs.load(folder.path / "config.yaml")).seeds
         for folder in found
-        if is_of(folder, config)
+        if matches(folder, config)
     }
     parts = "-".join(config[part]["name"] for part in configs.REGISTERED)
-    digest = hashlib.sha256(json.dumps(runs.fields(config), sort_keys=True).encode()).hexdigest()[:8]
-    trials = []
+    digest = hashlib.sha256(json.dumps(run_folders.fields(config), sort_keys=True).encode()).hexdigest()[:8]
+    runs = []
 
     def add(path: Path, seeds: Sequence[int]) -> None:
-        trials.append(
-            Trial(configs.override(config, [("seed", seeds[0]), ("num_seeds", len(seeds))]), experiment, path)
-        )
+        own = configs.override(config, [("seed", seeds[0]), ("num_seeds", len(seeds))])
+        runs.append(Run(experiment, configs.run_settings(own), path, own))
         missing.difference_update(seeds)
 
     for path, seeds in sorted(held.items(), key=lambda item: -len(item[1])):
@@ -252,10 +253,10 @@ def _trials(config: Config, directory: Path, found: Sequence[RunFolder]) -> list
         while last + 1 in missing:
             last += 1
         add(directory / f"{parts}-{digest}-seeds-{first}-{last}", range(first, last + 1))
-    return trials
+    return runs
 
 
-def _until(line: Line, end: float) -> Line:
-    """The part of a line that a figure shows, and at least its first point."""
+def _cut_line(line: Line, end: float) -> Line:
+    """Return the part of a line up to `end`, and at least its first point."""
     size = max(1, int(np.searchsorted(line.x, end * (1 + 1e-9), side="right")))
     return Line(line.x[:size], line.y[:size], line.lower[:size], line.upper[:size], line.num_seeds[:size])

@@ -1,55 +1,58 @@
-"""What the runs of figures of the thesis show, as Markdown."""
+"""Report on the reproduced figures of the thesis, as Markdown."""
 
 import math
 from collections.abc import Mapping, Sequence
 
-from jaxswarm.figures import figure as experiments
 from jaxswarm.figures.claims import Measured, Verdict
-from jaxswarm.figures.figure import FRACTIONS, Figure
-from jaxswarm.studies.trials import Trial
+from jaxswarm.figures.figure import FRACTIONS, Figure, thesis_measured, verdicts
+from jaxswarm.host.run import Run
 
 HEAD = """\
-# The figures of the thesis, run again
+# Reproduced figures of the thesis
 
-Medians over seeds. The final level is the mean of the last tenth of a curve, with quartiles where there are any. Steps
-are millions of agent steps to a share of the way from the start to the final level of the thesis's curve; a dash means
-not within what was trained. A verdict takes all seeds that a figure asks for, trained as far as the claim looks, and
-that it would be the same for nine of ten redrawings of these seeds (bootstrap); four of five redrawings give numbers
-within the brackets.
+All curves are medians over seeds. The final level is the mean over the last tenth of a curve, with its quartiles in
+brackets. The columns "50% at", "90% at" and "95% at" contain millions of agent steps. They are the steps to this share
+of the way from the start to the final level of the thesis's curve. A dash means that the curve does not reach the level
+or does not exist.
+
+A verdict requires all seeds of a figure, trained as far as the claim needs. It also requires that at least nine of ten
+bootstrap resamples of the seeds give the same result. Brackets in the column "here" are 80 % bootstrap intervals.
 """
 
 
 def page(sections: Sequence[str], origins: Sequence[tuple[str, str]]) -> str:
-    """The whole report; `origins` are devices and revisions that the runs were trained with."""
+    """Return the whole report. `origins` are pairs of the device and the code revision of each run."""
     revisions = {device: sorted({x for other, x in origins if other == device}) for device, _ in sorted(origins)}
-    lines = [f"Trained on {device}, revisions of the code: {', '.join(x)}.\n" for device, x in revisions.items()]
+    lines = [
+        f"The runs on {device} used these revisions of the code: {', '.join(x)}.\n" for device, x in revisions.items()
+    ]
     return "\n".join([HEAD, *lines, *sections])
 
 
 def section(
-    figure: Figure, trials: Mapping[str, Sequence[Trial]], measured: Mapping[str, Measured], overrides: Sequence[str]
+    figure: Figure, runs: Mapping[str, Sequence[Run]], measured: Mapping[str, Measured], overrides: Sequence[str]
 ) -> str:
-    """One figure: the picture, a table of its series, and verdicts; or that it was not run."""
+    """Return the section of one figure: its plots, a table of its series, and the verdicts."""
     title = f"## {figure.name}: {figure.title}\n\n"
     if not measured:
-        return f"{title}Not run.\n"
-    pictures = [f"![{figure.title}]({name}.png)" for name in figure.pictures]
-    changed = [f"Not as in the thesis: {' '.join(overrides)}."] if overrides else []
-    tables = [_table(figure, trials, measured), *([_verdicts(figure, measured)] if figure.claims else [])]
-    return title + "\n\n".join([*pictures, *changed, *_cuts(measured), *tables]) + "\n"
+        return f"{title}This figure was not run.\n"
+    images = [f"![{figure.title}]({name}.png)" for name in figure.pictures]
+    changed = [f"These overrides differ from the thesis: {' '.join(overrides)}."] if overrides else []
+    tables = [_table(figure, runs, measured), *([_verdicts(figure, measured)] if figure.claims else [])]
+    return title + "\n\n".join([*images, *changed, *_cuts(measured), *tables]) + "\n"
 
 
 def _cuts(measured: Mapping[str, Measured]) -> list[str]:
-    cut = [f"{name} at {ours.line.x[-1] / ours.end:.0%}" for name, ours in measured.items() if ours.is_cut]
-    return [f"Cut: {'; '.join(cut)} of what the figure shows."] if cut else []
+    cut = [f"{name} ({ours.line.x[-1] / ours.end:.0%})" for name, ours in measured.items() if ours.is_cut]
+    return [f"These series are shorter than the figure shows: {'; '.join(cut)}."] if cut else []
 
 
-def _table(figure: Figure, trials: Mapping[str, Sequence[Trial]], measured: Mapping[str, Measured]) -> str:
-    """A row for each series: final levels and steps, ours and the thesis's."""
+def _table(figure: Figure, runs: Mapping[str, Sequence[Run]], measured: Mapping[str, Measured]) -> str:
+    """Return a table with a row for each series: final levels and steps, ours and those of the thesis."""
     heads = ["series", "seeds", "M agent steps", "final", "in the thesis"]
     rows = [[*heads, *(f"{x:.0%} at (thesis)" for x in FRACTIONS)], ["---"] * (len(heads) + len(FRACTIONS))]
-    theirs = experiments.of_thesis(figure)
-    for name in trials:
+    theirs = thesis_measured(figure)
+    for name in runs:
         ours, thesis = measured.get(name), theirs.get(name)
         length = f"{ours.line.x[-1] / 1e6:.1f}" if ours else "not run"
         steps = [f"{_steps(thesis and ours, x)} ({_steps(thesis, x)})" for x in FRACTIONS]
@@ -59,7 +62,7 @@ def _table(figure: Figure, trials: Mapping[str, Sequence[Trial]], measured: Mapp
 
 def _verdicts(figure: Figure, measured: Mapping[str, Measured]) -> str:
     rows = [["claim", "verdict", "here", "in the thesis", "accepted"], ["---"] * 5]
-    for verdict in experiments.verdicts(figure, measured):
+    for verdict in verdicts(figure, measured):
         here, thesis, low, high = (_number(verdict, x) for x in (verdict.here, verdict.thesis, *verdict.interval))
         here += "" if "-" in (here, low) else f" [{low}, {high}]"
         rows.append([verdict.claim.says, verdict.outcome, here, thesis, _range(verdict)])

@@ -1,8 +1,8 @@
-"""Whole training states on disk: the latest few and the best, each written completely or not at all.
+"""Checkpoints of training states: the latest few and the best, each written completely or not at all.
 
-A checkpoint is a flat dict of NumPy arrays by dotted path (PRNG keys as their raw data), so that it can be read without
-this package and on any device, beside a JSON record of what else continues a run. Digests of its files are added once
-it is complete, so that damage is noticed before anything is read from it.
+A checkpoint is a flat dict of NumPy arrays by dotted path (PRNG keys as their raw data), readable without this package
+and on any device, beside a JSON record of everything else that resuming needs. Digests of its files are added once it
+is complete, so that damage is detected before anything is read.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxswarm.files import replace_text
 
-_RECORD = Path("record", "metadata")  # where Orbax puts the JSON record
+_RECORD = Path("record", "metadata")  # where Orbax writes the JSON record
 _DIGESTS = "digests.json"
 
 
@@ -29,7 +29,7 @@ class CheckpointError(RuntimeError):
 
 
 class Restored(NamedTuple):
-    """What a checkpoint held."""
+    """The content of a checkpoint."""
 
     update: int
     train_state: Any
@@ -38,7 +38,7 @@ class Restored(NamedTuple):
 
 
 class Checkpoints:
-    """Writes checkpoints into a directory from a thread of its own, and removes those that are not kept."""
+    """Write checkpoints into a directory from a separate thread, and remove those that are not kept."""
 
     def __init__(self, directory: Path, keep: int = 3):
         self._directory = directory.resolve()
@@ -50,11 +50,11 @@ class Checkpoints:
 
     @property
     def best_score(self) -> float:
-        """Highest score on disk, -inf without any."""
+        """Highest score on disk, -inf without a scored checkpoint."""
         return max((score for score in list(self._scores.values()) if score is not None), default=-np.inf)
 
     def save(self, update: int, train_state: Any, record: dict[str, Any], score: float | None) -> None:
-        """Starts writing, after waiting for the checkpoint before. Updates come in increasing order.
+        """Start writing a checkpoint, after waiting for the previous one. Updates must come in increasing order.
 
         `score` is the mean evaluation return of this policy, `None` if it was not evaluated.
         """
@@ -67,7 +67,7 @@ class Checkpoints:
         self._pending = self._writer.submit(self._write, update, arrays, record)
 
     def close(self) -> None:
-        """Waits until all is on disk; raises what kept it from getting there."""
+        """Wait until all checkpoints are on disk; raises the error of a failed write."""
         self._writer.submit(self._close)
         self._writer.shutdown()
         self._pending.result()
@@ -78,9 +78,11 @@ class Checkpoints:
         options = ocp.CheckpointManagerOptions(
             max_to_keep=None,
             create=False,
-            cleanup_tmp_directories=any(self._directory.iterdir()),  # outlives a manager that saves nothing
+            cleanup_tmp_directories=any(
+                self._directory.iterdir()
+            ),  # this directory outlives a manager that saves nothing
             enable_async_checkpointing=False,
-            multiprocessing_options=_alone(),
+            multiprocessing_options=_single_process_options(),
         )
         self._manager = ocp.CheckpointManager(self._directory, options=options)
 
@@ -91,7 +93,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp  # noqa: PLC0415
 
         if update in self._manager.all_steps():
-            self._manager.delete(update)  # was written before its evaluation was known
+            self._manager.delete(update)  # it was written before its evaluation was known
         state = ocp.args.StandardSave({name: x for name, x in arrays.items() if x.size})
         self._manager.save(update, args=ocp.args.Composite(state=state, record=ocp.args.JsonSave(record)))
         path = self._directory / str(update)
@@ -114,10 +116,10 @@ def restore(
     on_damage: Callable[[str], None] = print,
     up_to: int | float = math.inf,
 ) -> Restored | None:
-    """The last or the best checkpoint that is whole, of an update `up_to` some; `None` where none was ever written.
+    """Restore the last or the best undamaged checkpoint of an update <= `up_to`; `None` if none was ever written.
 
-    `template` is the abstract state, `jax.eval_shape(init, ...)`. Says of each damaged checkpoint that it was skipped;
-    raises `CheckpointError` when there is no other.
+    `template` is the abstract state, `jax.eval_shape(init, ...)`. `on_damage` gets one line for each damaged checkpoint
+    that is skipped. Raises a `CheckpointError` if there are checkpoints but none can be restored.
     """
     updates = sorted((update for update in _updates(directory) if update <= up_to), reverse=True)
     if which == "best":
@@ -126,7 +128,7 @@ def restore(
     for update in updates:
         try:
             return _restore(directory, update, template)
-        except Exception as error:  # whatever a damaged file leads to
+        except Exception as error:  # a damaged file can raise anything
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             on_damage(f"checkpoint {directory / str(update)} is damaged, trying another one: {reason}")
     if updates:
@@ -135,7 +137,7 @@ def restore(
 
 
 def set_aside_after(directory: Path, update: int) -> None:
-    """Renames checkpoints of later updates, which could not be restored, so that the run may write them again."""
+    """Rename checkpoints of later updates, which could not be restored, so that the run can write them again."""
     for later in _updates(directory):
         if later > update:
             attempt = 0
@@ -149,19 +151,26 @@ def _restore(directory: Path, update: int, template: Any) -> Restored:
 
     path = (directory / str(update)).resolve()
     record = json.loads((path / _RECORD).read_text())
-    if (path / _DIGESTS).exists():  # missing if the run was killed right after the checkpoint was complete
+    if (path / _DIGESTS).exists():  # missing if the run was killed right after the checkpoint was completed
         written, found = json.loads((path / _DIGESTS).read_text()), _digests(path)
         changed = [name for name, digest in written.items() if found.get(name) != digest]
         if changed:
-            raise ValueError(f"{changed[0]} is not as it was written")
-    with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
+            raise ValueError(f"{changed[0]} has changed since it was written")
+    with ocp.StandardCheckpointer(multiprocessing_options=_single_process_options()) as reader:
         arrays = reader.restore(path / "state")
-    train_state = _from_arrays(arrays, record["key_impls"], template)
+    arrays, key_impls = ({_current_name(name): x for name, x in old.items()} for old in (arrays, record["key_impls"]))
+    train_state = _from_arrays(arrays, key_impls, template)
     return Restored(update, train_state, record["run"], record["score"])
 
 
-def _alone() -> Any:
-    """Orbax is not to wait for other processes: what they have was fetched, and they do not write."""
+def _current_name(path: str) -> str:
+    """Translate the path of a leaf that version 0.1 wrote."""
+    first, dot, rest = path.partition(".")
+    return f"envs{dot}{'is_complete' if rest == 'is_whole' else rest}" if first == "worlds" else path
+
+
+def _single_process_options() -> Any:
+    """Return options that keep Orbax from waiting for other processes, which do not write."""
     import orbax.checkpoint as ocp  # noqa: PLC0415
 
     me = jax.process_index()
@@ -184,7 +193,7 @@ def _read_score(directory: Path, update: int) -> float | None:
 
 
 def _digests(path: Path) -> dict[str, str]:
-    """SHA-256 of every file of a checkpoint, by name."""
+    """Return the SHA-256 of every file of a checkpoint, by name."""
     files = sorted(file for file in path.rglob("*") if file.is_file() and _DIGESTS not in file.name)
     return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
@@ -199,7 +208,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _to_arrays(tree: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Host copies of all leaves by path, and the generators of those that are PRNG keys."""
+    """Return host copies of all leaves by path, and the implementations of those that are PRNG keys."""
     leaves = dict(_named_leaves(tree))
     keys = {name: str(jax.random.key_impl(leaf)) for name, leaf in leaves.items() if _is_key(leaf)}
     raw = {name: jax.random.key_data(leaf) if name in keys else leaf for name, leaf in leaves.items()}
@@ -207,13 +216,13 @@ def _to_arrays(tree: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], key_impls: dict[str, str], template: Any) -> Any:
-    """The tree of `template` with these leaves."""
+    """Return the tree of `template` with these leaves."""
     leaves = []
     for name, expected in _named_leaves(template):
         if not expected.size:
-            arrays[name] = np.zeros(expected.shape, expected.dtype)  # Orbax writes no empty arrays
+            arrays[name] = np.zeros(expected.shape, expected.dtype)  # Orbax does not write empty arrays
         if name not in arrays:
-            raise ValueError(f"it has no {name}: it is of another kind of experiment or of another version")
+            raise ValueError(f"it has no {name}, so it belongs to another experiment or version")
         leaf = jnp.asarray(arrays[name])
         if name in key_impls:
             leaf = jax.random.wrap_key_data(leaf, impl=key_impls[name])

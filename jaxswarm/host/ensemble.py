@@ -1,9 +1,8 @@
-"""Many runs of one shape in one program: several seeds, several numbers, spread over all devices.
+"""Many runs in a single compiled program: vectorized seeds and numeric hyperparameters, spread over all devices.
 
-A batch of runs is an `Experiment` and a `TrainState` whose leaves have one more axis, the first, of runs. Each device
-has its share of the runs and trains `width` of them at a time, side by side, one such group after the other. Where
-there are more devices than runs, the worlds of a run are spread over several: arithmetic is that of one device, and
-XLA adds up gradients across devices.
+A batch of runs is an `Experiment` and a `TrainState` whose leaves have a leading runs axis. Each device trains its
+share of the runs, `width` of them vectorized at a time. If there are more devices than runs, the environments of a run
+are spread over several devices: the arithmetic is that of one device, and XLA sums gradients across devices.
 """
 
 import contextlib
@@ -28,40 +27,45 @@ from jaxswarm.training import Experiment, TrainState, evaluate, init, train_chun
 from jaxswarm.types import Metrics
 
 RUNS_AXIS = "runs"
-CPU_WIDTH = 1  # runs side by side on a CPU, whose cache holds the activations of one; measured, see benchmarks/LOG.md
-MEMORY_SHARE = 0.9  # of what is free that a program may take
-LESS_MEMORY = "smaller num_envs, num_steps, num_seeds, num_eval_envs or learner.batch_size need less"
+CPU_WIDTH = 1  # vectorized runs on a CPU, whose cache holds the activations of one; measured in benchmarks/LOG.md
+MEMORY_SHARE = 0.9  # of the free memory that a program may use
+LESS_MEMORY = "reduce num_envs, num_steps, num_seeds, num_eval_envs or learner.batch_size"
 
-Program = Callable[[Experiment, TrainState, Any], tuple[TrainState, Metrics]]  # the last: how many updates
+Program = Callable[
+    [Experiment, TrainState, Any], tuple[TrainState, Metrics]
+]  # the last argument is the number of updates
 
 
 class RunBatch(NamedTuple):
-    """Runs in one program."""
+    """Runs that are trained in one program."""
 
     experiments: Experiment  # leaves [runs]
-    mesh: Mesh | None  # over the devices; None: there is one
+    mesh: Mesh | None  # of devices; None: a single device
 
     @property
     def num_runs(self) -> int:
-        """How many."""
+        """Number of runs, that is experiments times seeds."""
         return jax.tree.leaves(self.experiments)[0].shape[0]
 
 
 def use_cores(num_runs: int) -> None:
-    """Makes each core of a CPU a device that trains runs of its own; has to come before any device is used.
+    """Make each CPU core a device that trains its own runs; must be called before JAX uses any device.
 
-    Two cores then train two runs in half the time that both take for one after the other; see benchmarks/LOG.md. Does
-    nothing where devices are in use already, or the environment says how many there are.
+    Two cores then train two runs in half the time of training them in sequence (benchmarks/LOG.md). This does nothing
+    if devices are already in use, or if XLA_FLAGS or JAX_COORDINATOR_ADDRESS determine the devices.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     is_decided = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if not is_decided and "JAX_COORDINATOR_ADDRESS" not in os.environ:
-        with contextlib.suppress(RuntimeError):  # devices are in use
+        with contextlib.suppress(RuntimeError):  # devices are already in use
             jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
 
 
 def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> RunBatch:
-    """`num_seeds` runs of each experiment, one after the other; the experiments differ in numbers only."""
+    """Combine `num_seeds` runs of each experiment, the seeds of the first experiment first.
+
+    Raises a `ValueError` if the experiments differ in more than numeric (traced) hyperparameters.
+    """
     leaves = [jax.tree.leaves(experiment) for experiment in experiments]
     structures = {jax.tree.structure(experiment) for experiment in experiments}
     if len(structures) > 1:
@@ -72,13 +76,16 @@ def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> RunBatch:
 
 
 def _stack(numbers: Sequence[Any]) -> np.ndarray:
-    """One row per experiment, in JAX's own precision."""
+    """Stack one row per experiment, in JAX's own precision."""
     stacked = np.stack([np.asarray(x) for x in numbers])
     return stacked.astype(jax.dtypes.canonicalize_dtype(stacked.dtype))
 
 
 def make_mesh(num_runs: int, num_envs: int) -> Mesh | None:
-    """As many devices as divide runs and worlds, `None` if that is one; several processes need all of theirs."""
+    """Return a mesh of as many devices as divide runs and environments, `None` for a single device.
+
+    Raises a `ValueError` if several processes cannot use all of their devices.
+    """
     num_devices = jax.device_count()
     runs, envs = mesh_shape(num_runs, num_envs, num_devices)
     if jax.process_count() > 1 and runs * envs < num_devices:
@@ -93,15 +100,21 @@ def make_mesh(num_runs: int, num_envs: int) -> Mesh | None:
 
 
 def mesh_shape(num_runs: int, num_envs: int, num_devices: int) -> tuple[int, int]:
-    """How many devices share the runs and, of each of these, how many its worlds: as many as divide both."""
+    """Return how many devices share the runs, and how many share the environments of each run."""
     shapes = [
         (runs, math.gcd(num_envs, num_devices // runs)) for runs in range(1, num_devices + 1) if num_runs % runs == 0
     ]
     return max(shapes, key=lambda shape: (math.prod(shape), shape))
 
 
+def abstract_state(experiment: Experiment, num_seeds: int = 1) -> TrainState:
+    """Return shapes and dtypes of the states of `num_seeds` seeds, without computing them."""
+    state = jax.eval_shape(init, experiment, jax.random.key(0))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_seeds, *x.shape), x.dtype), state)
+
+
 def place(batch: RunBatch, states: TrainState) -> TrainState:
-    """The states where the batch is computed."""
+    """Move the states to the devices that compute the batch."""
     raw = jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x), states)
     impls = jax.tree.map(lambda x: str(jax.random.key_impl(x)) if _is_key(x) else "", states)
 
@@ -112,14 +125,14 @@ def place(batch: RunBatch, states: TrainState) -> TrainState:
 
 
 def init_batch(batch: RunBatch, seeds: Sequence[int]) -> TrainState:
-    """States before the first update, one for each run; those of the same seeds alone, bit by bit."""
+    """Return the initial state of each run, bit for bit that of its seed alone."""
     seeds_array = np.asarray(seeds, np.uint32)
     shapes = jax.eval_shape(_start, batch.experiments, seeds_array)
     return jax.jit(_start, out_shardings=_shardings(batch.mesh, shapes))(batch.experiments, seeds_array)
 
 
 def with_params(states: TrainState, params: Sequence[Any]) -> TrainState:
-    """The states with these parameters, of one network for each run."""
+    """Replace the network parameters of each run's state."""
     given = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *params)
     placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), given, states.learner.params)
     return dataclasses.replace(states, learner=dataclasses.replace(states.learner, params=placed))
@@ -130,7 +143,7 @@ def _start(experiments: Experiment, seeds: UInt[Any, " runs"]) -> TrainState:
 
 
 def _shardings(mesh: Mesh | None, states: TrainState) -> Any:
-    """Where the leaves of states are; `None`: on the one device."""
+    """Return the sharding of each leaf of the states; `None` for a single device."""
     if mesh is None:
         return None
     by_run, by_env = (NamedSharding(mesh, spec) for spec in (P(RUNS_AXIS), P(RUNS_AXIS, ENVS_AXIS)))
@@ -143,9 +156,9 @@ def _is_key(x: Any) -> bool:
 
 
 def compile_batch(batch: RunBatch, states: TrainState, size: int, warn: Callable[[str], None]) -> Program:
-    """`train_chunk` of every run, donating the states; as many runs side by side as memory holds.
+    """Compile `train_chunk` for every run, with donated states and as many vectorized runs as fit into memory.
 
-    Where memory holds not even one, it says so before anything is computed.
+    Calls `warn` with one line if fewer runs fit than there are, or if not even one does.
     """
     num_local = batch.num_runs // (batch.mesh.shape[RUNS_AXIS] if batch.mesh else 1)
     width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
@@ -156,19 +169,19 @@ def compile_batch(batch: RunBatch, states: TrainState, size: int, warn: Callable
         needed, free = _memory(program), _free_memory()
         if needed <= free:
             break
-        sizes = f"{needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free"
+        sizes = f"{needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free"
         if width == 1:
             warn(f"training needs {sizes}; {LESS_MEMORY}")
             break
         smaller = [n for n in range(1, width) if num_local % n == 0]
         width = max(n for n in smaller if n == 1 or n <= width * free / needed)
-        warn(f"{num_local} runs side by side need {sizes}: {width} at a time")
+        warn(f"{num_local} vectorized runs need {sizes}; training {width} at a time")
 
     return lambda experiments, states, num_updates: program(experiments, states, np.int32(num_updates))
 
 
 def compiler_options() -> dict[str, Any] | None:
-    """What XLA is told beside its defaults: to use vectors of 512 bits where a CPU has them; see benchmarks/LOG.md."""
+    """Return XLA options: a CPU uses 512-bit vectors if it has them (measured in benchmarks/LOG.md)."""
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
 
 
@@ -180,7 +193,7 @@ def _advance(
 
 
 def evaluate_batch(batch: RunBatch, states: TrainState) -> Metrics:
-    """`evaluate` of every run; metrics [runs]."""
+    """Evaluate the deterministic policy of every run; metrics [runs]."""
     with _on(batch):
         return _evaluate(batch.experiments, states, batch.mesh)
 
@@ -191,12 +204,12 @@ def _evaluate(experiments: Experiment, states: TrainState, mesh: Mesh | None) ->
 
 
 def fetch(batch: RunBatch, tree: Any) -> Any:
-    """The tree on this process's own device, wherever its parts are; a call that all processes have to make."""
+    """Gather the tree on this process's own device; all processes must make this call."""
     if jax.process_count() == 1 or batch.mesh is None:
         return tree
     everywhere = jax.jit(lambda x: x, out_shardings=NamedSharding(batch.mesh, P()))
 
-    def local(x: Array) -> Array:  # one after the other: processes have to communicate in the same order
+    def local(x: Array) -> Array:  # one leaf at a time, because processes must communicate in the same order
         return jax.block_until_ready(everywhere(x)).addressable_data(0)
 
     return jax.tree.map(local, tree)
@@ -207,14 +220,14 @@ def _on(batch: RunBatch) -> contextlib.AbstractContextManager:
 
 
 def _spread(mesh: Mesh | None, function: Callable, width: int) -> Callable:
-    """The function of one run, and of what is common to all, for all runs; each device takes those that it has."""
+    """Map a function of one run, and of arguments common to all, over the runs; each device takes its own."""
 
     def local(experiments: Experiment, states: TrainState, *common: Array) -> Any:
         def one(run: tuple[Experiment, TrainState]) -> Any:
             return function(*run, *common)
 
         runs, num_local = (experiments, states), states.update.shape[0]
-        if num_local == 1:  # no loop: exactly the program of one run
+        if num_local == 1:  # without a loop, this is exactly the program of one run
             return jax.tree.map(lambda x: x[None], one(jax.tree.map(lambda x: x[0], runs)))
         if width == num_local:
             return jax.vmap(one)(runs)
@@ -234,7 +247,7 @@ def _spread(mesh: Mesh | None, function: Callable, width: int) -> Callable:
 
 
 def _memory(program: Any) -> int:
-    """Bytes that a device needs to run it; 0 if that is not known."""
+    """Return the bytes that a device needs to run the program; 0 if unknown."""
     analysis = program.memory_analysis()
     if analysis is None:
         return 0
@@ -243,13 +256,13 @@ def _memory(program: Any) -> int:
 
 
 def _allotted(folder: Path = Path("/sys/fs/cgroup")) -> float:
-    """Bytes that a container may still take; infinite without a limit. Files are dropped from memory where needed."""
+    """Return the bytes that a container may still allocate, with its file cache as free; infinite without a limit."""
     places = (
         (folder, "memory.max", "memory.current"),
-        (folder / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),  # of cgroups of version 1
+        (folder / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),  # cgroups v1
     )
     for place, limit, used in places:
-        with contextlib.suppress(OSError, ValueError):  # no such limit, or "max"
+        with contextlib.suppress(OSError, ValueError):  # no limit
             stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
             files = int(stat.get("inactive_file", stat.get("total_inactive_file", 0)))
             return float(int((place / limit).read_text()) - int((place / used).read_text()) + files)
@@ -257,7 +270,7 @@ def _allotted(folder: Path = Path("/sys/fs/cgroup")) -> float:
 
 
 def _free_memory() -> float:
-    """Bytes that a program may take on each device; infinite if that is not known."""
+    """Return the bytes that a program may use on each device; infinite if unknown."""
     if jax.default_backend() == "cpu":
         return MEMORY_SHARE * min(psutil.virtual_memory().available, _allotted()) / jax.local_device_count()
     stats = jax.local_devices()[0].memory_stats()

@@ -1,8 +1,8 @@
-"""Evaluations for the programs that others watch training with; each is an extra of this package.
+"""Loggers that send evaluations to TensorBoard and Weights & Biases. Each needs an extra of this package.
 
-A logger is opened as `LOGGERS[name](run_dir, config, seed)` and is one stream of events, that of this seed: `log(row)`
-takes the rows of `metrics.csv` in order, with agent steps as the horizontal axis and without what is NaN; `close()`
-returns when all is written. A `ConfigError` says which extra has to be installed.
+`LOGGERS[name](run_dir, config, seed)` opens the logger of one seed. `log(row)` logs the rows of `metrics.csv` in order,
+over agent steps and without NaN values. `close()` returns when everything is written. Opening a logger raises a
+`ConfigError` that names the extra if its package is missing.
 """
 
 import importlib
@@ -17,14 +17,14 @@ from typing import Any, Protocol
 from jaxswarm.config import ConfigError
 from jaxswarm.files import Row
 
-AXES = ("agent_steps", "seed")  # of a row, what is said otherwise
+AXES = ("agent_steps", "seed")  # columns that are no metrics: the horizontal axis and the name of the stream
 
 
 class Logger(Protocol):
-    """What is done with an open logger."""
+    """Open logger of one seed."""
 
     def log(self, row: Row) -> None:
-        """Adds an evaluation."""
+        """Log the numbers of an evaluation."""
         ...
 
     def close(self) -> None:
@@ -33,34 +33,34 @@ class Logger(Protocol):
 
 
 class TensorBoard:
-    """Event files in `run_dir/tensorboard/seed_<seed>`; a resumed run adds a file of its own."""
+    """Logger that writes event files to `run_dir/tensorboard/seed_<seed>`. A resumed run adds another file."""
 
     def __init__(self, run_dir: str | Path, config: Mapping[str, Any] | None, seed: int):
-        package = load("tensorboard")
+        package = import_package("tensorboard")
         self._writer = package.SummaryWriter(str(Path(run_dir) / "tensorboard" / f"seed_{seed}"))
         if config is not None:
             self._writer.add_text("config", "\n".join(f"    {line}" for line in _lines(config)))
 
     def log(self, row: Row) -> None:
-        """Adds each number as a scalar at the agent steps of the row."""
+        """Log each number as a scalar at the agent steps of the row."""
         for name, value in _numbers(row).items():
             self._writer.add_scalar(name, value, global_step=row["agent_steps"])
         self._writer.flush()
 
     def close(self) -> None:
-        """Closes the event file."""
+        """Close the event file."""
         self._writer.close()
 
 
 class WeightsAndBiases:
-    """A run of the project `jaxswarm`, in the group of its run folder; offline where `WANDB_MODE=offline` says so.
+    """Logger that writes to a Weights & Biases run in the project `jaxswarm`; the run folder is its group.
 
-    Its files are in `run_dir/wandb`; a resumed run goes on with the same one. Project, account and the like follow the
-    variables `WANDB_...` of the environment.
+    Its files are in `run_dir/wandb`. A resumed run resumes the same W&B run. Environment variables `WANDB_...` set
+    project, account and other options; `WANDB_MODE=offline` logs without network.
     """
 
     def __init__(self, run_dir: str | Path, config: Mapping[str, Any] | None, seed: int):
-        package, run_dir = load("wandb"), Path(run_dir).resolve()
+        package, run_dir = import_package("wandb"), Path(run_dir).resolve()
         run_dir.mkdir(parents=True, exist_ok=True)
         id_file = run_dir / "wandb" / f"seed_{seed}.id"
         id_file.parent.mkdir(exist_ok=True)
@@ -84,11 +84,11 @@ class WeightsAndBiases:
         self._run.define_metric("*", step_metric="agent_steps")
 
     def log(self, row: Row) -> None:
-        """Adds the numbers, and the agent steps that they are shown over."""
+        """Log the numbers together with the agent steps, their horizontal axis."""
         self._run.log({"agent_steps": row["agent_steps"], **_numbers(row)})
 
     def close(self) -> None:
-        """Ends the run; online, when all is uploaded."""
+        """Finish the W&B run; in online mode, this waits until everything is uploaded."""
         self._run.finish()
 
 
@@ -100,14 +100,15 @@ LOGGERS: dict[str, Callable[[str | Path, Mapping[str, Any] | None, int], Logger]
 }
 
 
-def load(name: str) -> ModuleType:
-    """The package that a logger needs; a `ConfigError` says how to get it, or which loggers there are."""
+def import_package(name: str) -> ModuleType:
+    """Import the package of a logger. Raise a `ConfigError` for an unknown logger or a missing package."""
     if name not in PACKAGES:
         raise ConfigError(f"loggers: must be a list of {', '.join(PACKAGES)}, got {name!r}")
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError as error:
-        raise ConfigError(f'{name} needs a package: pip install "jaxswarm[{name}]"') from error
+        hint = f'install it with: pip install "jaxswarm[{name}]"'
+        raise ConfigError(f"loggers: {name} needs the package {PACKAGES[name]}; {hint}") from error
 
 
 def _numbers(row: Row) -> Row:

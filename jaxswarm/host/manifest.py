@@ -1,4 +1,4 @@
-"""`manifest.json`: versions, device, revision, and the exact numbers of steps of a run."""
+"""Manifest of a run, `manifest.json`: versions, device, code revision, and exact numbers of steps."""
 
 import importlib.metadata
 import json
@@ -20,13 +20,17 @@ PACKAGES = ("jaxswarm", "jax", "jaxlib", "flax", "optax", "distrax", "orbax-chec
 
 
 def describe(experiment: Any, num_updates: int, seeds: Sequence[int]) -> dict[str, Any]:
-    """Versions, device, revision and the exact arithmetic of steps."""
+    """Return the content of the manifest, as values that JSON can store.
+
+    It contains the start time, the command, the seeds, all numbers of steps that follow from the experiment, and
+    `provenance`.
+    """
     per_update = experiment.agent_steps_per_update
     steps = {
         "updates": num_updates,
         "num_agents": experiment.task.num_agents,
         "num_envs": experiment.num_envs,
-        "steps_per_world_and_update": experiment.num_steps,
+        "steps_per_env_and_update": experiment.num_steps,
         "environment_steps_per_update": experiment.num_envs * experiment.num_steps,
         "agent_steps_per_update": per_update,
         "environment_steps": num_updates * experiment.num_envs * experiment.num_steps,
@@ -51,7 +55,7 @@ def describe(experiment: Any, num_updates: int, seeds: Sequence[int]) -> dict[st
 
 
 def provenance() -> dict[str, Any]:
-    """What code ran on what machine."""
+    """Return the versions of packages, the platform, the device, and the Git revision of the code."""
     device = jax.devices()[0]
     return {
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES},
@@ -62,10 +66,10 @@ def provenance() -> dict[str, Any]:
 
 
 def write_manifest(path: Path, content: dict[str, Any]) -> None:
-    """Writes the manifest; a resumed run adds its own beside those of the sessions before."""
+    """Write the manifest. A resumed run keeps the manifests of its earlier sessions under `earlier_sessions`."""
     try:
-        before = json.loads(path.read_text())
-        content = content | {"earlier_sessions": [*before.pop("earlier_sessions", []), before]}
+        previous = json.loads(path.read_text())
+        content = content | {"earlier_sessions": [*previous.pop("earlier_sessions", []), previous]}
     except (OSError, ValueError):
         pass
     replace_text(path, json.dumps(content, indent=2) + "\n")
@@ -79,7 +83,10 @@ def _version(name: str) -> str | None:
 
 
 def _git_revision() -> str | None:
-    """Commit of the checkout that this package runs from, marked if files differ from it."""
+    """Return the commit of the checkout that contains this package, marked "-dirty" if tracked files differ from it.
+
+    Return `None` outside of a checkout.
+    """
     checkout = Path(__file__).resolve().parent.parent.parent
     if not (checkout / ".git").exists():
         return None

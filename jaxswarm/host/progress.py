@@ -1,21 +1,24 @@
-"""Progress of training: a bar on a terminal, a line now and then elsewhere."""
+"""Progress display of training: a bar on a terminal, and a line every 10 s elsewhere."""
 
 import importlib.util
 import math
 import time
 from typing import Any
 
-SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal to draw a bar on
+SECONDS_BETWEEN_LINES = 10.0  # without a terminal
 
 
 class Progress:
-    """Rate, latest evaluation and time left: a bar on a terminal, a line now and then elsewhere."""
+    """Display of speed, latest evaluation and remaining time: a bar on a terminal, lines elsewhere.
+
+    Use it as a context manager, which shows that the program is being compiled. `is_shown=False` prints nothing.
+    """
 
     def __init__(self, update: int, num_updates: int, agent_steps_per_update: int, is_shown: bool = True):
         self._num_updates = num_updates
         self._agent_steps_per_update = agent_steps_per_update
         self._is_shown = is_shown
-        self._first: tuple[float, int] | None = None  # when the first chunk was done
+        self._first: tuple[float, int] | None = None  # time and update at the end of the first chunk
         self._last_line = -math.inf
         self._started = time.monotonic()
         self._update = update
@@ -33,14 +36,14 @@ class Progress:
             self._bar.stop()
 
     def begin(self) -> None:
-        """Shows that compiling is over: the first chunk of a slow run takes minutes."""
+        """Show that compilation is finished. The first chunk of a slow run may take minutes."""
         if self._bar:
             self._bar.update(self._task, rate="training")
         elif self._is_shown:
             print(f"compiled in {time.monotonic() - self._started:.0f} s; training ...", flush=True)
 
     def advance(self, update: int, evaluation: float | None) -> None:
-        """Shows that so many updates are done; `evaluation` is the latest return."""
+        """Show that `update` updates are done. `evaluation` is the latest return, or `None` before the first one."""
         now = time.monotonic()
         self._update = update
         self._first = self._first or (now, update)
@@ -60,7 +63,7 @@ class Progress:
             print(f"{done} · return {return_text} · {rate_text} · {left_text}", flush=True)
 
     def warn(self, text: str) -> None:
-        """Prints a line, above the bar if there is one."""
+        """Print a warning, above the bar if there is one."""
         if self._bar:
             self._bar.console.print(f"warning: {text}", markup=False, highlight=False)
         elif self._is_shown:
@@ -70,7 +73,8 @@ class Progress:
         from rich import console, progress  # noqa: PLC0415
 
         screen = console.Console()
-        is_bare = screen.is_jupyter and importlib.util.find_spec("ipywidgets") is None  # a bar would warn, and not move
+        # Without ipywidgets, rich warns and its bar does not move in notebooks.
+        is_bare = screen.is_jupyter and importlib.util.find_spec("ipywidgets") is None
         if is_bare or not (screen.is_terminal or screen.is_jupyter):
             return None
         columns = (
@@ -87,7 +91,7 @@ class Progress:
 
 
 def _short(number: float) -> str:
-    """Three digits and a unit: 41.2k."""
+    """Format a number with three digits and a unit, such as 41.2k."""
     for scale, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if number >= scale:
             return f"{number / scale:.3g}{unit}"

@@ -1,47 +1,28 @@
-"""What becomes of one run while it is trained: rows, the files in its folder, checkpoints."""
+"""The results of one run while it is trained: rows of metrics.csv, loggers, plots and checkpoints."""
 
-import contextlib
 import dataclasses
 import math
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from jaxswarm import config as configs
 from jaxswarm import files
 from jaxswarm.analysis import training_curve
-from jaxswarm.config import ConfigError
 from jaxswarm.files import RETURN, Row
 from jaxswarm.host import manifest
 from jaxswarm.host.checkpoint import Checkpoints, Restored
 from jaxswarm.host.loggers import LOGGERS, Logger
-from jaxswarm.training import Experiment, TrainState, is_loss
+from jaxswarm.host.run import Run
+from jaxswarm.training import TrainState, is_loss
 
-# keys of a config that are not the run's own
-MAY_CHANGE = {*configs.LENGTHS, "checkpoint_seconds", "keep_checkpoints", "render_every", "loggers", "imports"}
-SECONDS_PER_CURVE = 60.0  # from one picture of the curve during training to the next
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """An experiment and its seeds, which are trained side by side; with a folder, files are written into it."""
-
-    experiment: Experiment
-    seeds: tuple[int, ...] = (0,)
-    run_dir: Path | None = None
-    loggers: tuple[str, ...] = ()  # names in `LOGGERS`, which need a folder
-    config: Mapping[str, Any] | None = None  # goes into the folder, and is shown to loggers
-    on_evaluation: Callable[[int, Any], None] | None = None  # called with updates done and parameters [seeds, ...]
-    init_params: Any = None  # of the network, that all seeds begin with; None: each draws its own
+SECONDS_PER_CURVE = 60.0  # between two plots of the learning curve during training
 
 
 @dataclasses.dataclass
 class _Candidate:
-    """A state that may be saved, and what else continues the run from there."""
+    """A state that may be saved, with everything else that resuming from it needs."""
 
     update: int
     states: TrainState  # leaves [seeds, ...]
@@ -49,105 +30,36 @@ class _Candidate:
     score: float | None
 
 
-@contextlib.contextmanager
-def locked(run_dir: Path) -> Iterator[None]:
-    """Keeps other processes from training into a folder; a `ConfigError` if one does. Ends with the process at latest.
-
-    Does nothing where the system has no such locks.
-    """
-    run_dir.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as stack:
-        try:
-            import fcntl  # noqa: PLC0415
-
-            descriptor = os.open(run_dir, os.O_RDONLY)
-            stack.callback(os.close, descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"{run_dir} is being trained by another process; wait for it, or stop it") from None
-        except (ImportError, OSError):
-            pass
-        yield
-
-
-def has_checkpoint(run_dir: Path) -> bool:
-    """Whether there is anything to go on from."""
-    return any(run_dir.glob("checkpoints/[0-9]*"))
-
-
-def started_and_new(run_dirs: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Folders of runs that go on together; and those that are empty where others have checkpoints."""
-    has_none = [path for path in run_dirs if not has_checkpoint(path)]
-    is_empty = {path: path in has_none and not files.read_rows(path / "metrics.csv") for path in run_dirs}
-    new = [path for path in run_dirs if is_empty[path] and len(has_none) < len(run_dirs)]
-    return [path for path in run_dirs if path not in new], new
-
-
-def check_folder(run: Run, resume: bool) -> None:
-    """Raises `FileExistsError` if training would replace what is in the run's folder, or mix it with another run."""
-    if run.run_dir is None:
-        return
-    if not resume:
-        if (run.run_dir / "metrics.csv").exists():
-            raise FileExistsError(f"{run.run_dir} holds a run already; resume it or choose another folder")
-        return
-    rows = files.read_rows(run.run_dir / "metrics.csv")
-    if rows and not (run.run_dir / "checkpoints").exists():
-        raise FileExistsError(
-            f"{run.run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "
-            "choose another folder to train it again"
-        )
-    seeds = sorted({int(row["seed"]) for row in rows})
-    changed = _changes(run) if set(seeds) <= set(run.seeds) else {"seeds": (seeds, list(run.seeds))}
-    if changed:
-        name, (before, now) = next(iter(changed.items()))
-        raise FileExistsError(f"{run.run_dir} holds another run: {name} is {before} there, and {now} here")
-
-
-def _changes(run: Run) -> dict[str, tuple]:
-    """Keys of the config that resuming may not change, with the value in the folder and that of the run."""
-    path = (run.run_dir or Path()) / "config.yaml"
-    if run.config is None or not path.exists():
-        return {}
-    before = configs.read(path)
-    with contextlib.suppress(ConfigError):  # the config of another version stays as it is
-        before = configs.validate(before)
-    one, other = (configs.flat(config) for config in (before, run.config))
-    names = [name for name in other if name not in MAY_CHANGE and one.get(name) != other[name]]
-    return {name: (one.get(name), other[name]) for name in names}
-
-
 class Recorder:
-    """Takes down what came out of updates, in order. Arrays are [seeds, ...], in the order of the run's seeds."""
+    """Record the results of updates, in order. Arrays are [seeds, ...], in the order of the run's seeds."""
 
-    def __init__(self, run: Run, restored: Restored | None, keep_checkpoints: int):
+    def __init__(self, run: Run, restored: Restored | None):
         record: dict[str, Any] = restored.record if restored else {}
         self.run = run
         self.rows: list[Row] = []
         self.reason: dict[int, str] = {int(seed): x for seed, x in record.get("diverged", {}).items()}
         self._since_evaluation: dict[str, list[list[float]]] = record.get("since_evaluation", {})  # [updates][seeds]
         self._start = restored.update if restored else 0
-        self._keep_checkpoints = keep_checkpoints
         self._checkpoints: Checkpoints | None = None
         self._loggers: dict[int, list[Logger]] = {}
         self._last: _Candidate | None = None
-        self._best: _Candidate | None = None  # better than all on disk, and not yet there
-        self._last_drawn = time.monotonic()
+        self._best: _Candidate | None = None  # better than every checkpoint on disk, and not saved yet
+        self._last_plotted = time.monotonic()
 
-    def open(self, num_updates: int) -> None:
-        """Prepares the run folder; called once the device is at work."""
-        run_dir = self.run.run_dir
+    def open(self) -> None:
+        """Prepare the run folder, once the first chunk has been compiled and dispatched."""
+        run, run_dir = self.run, self.run.run_dir
         if run_dir:
             run_dir.mkdir(parents=True, exist_ok=True)
-            content = manifest.describe(self.run.experiment, num_updates, self.run.seeds)
+            content = manifest.describe(run.experiment, run.num_updates, run.seeds)
             manifest.write_manifest(run_dir / "manifest.json", content)
             self.rows = files.keep_rows_before(run_dir / "metrics.csv", self._start)
-            self._checkpoints = Checkpoints(run_dir / "checkpoints", self._keep_checkpoints)
-            for seed in self.run.seeds:
-                self._loggers[seed] = [LOGGERS[name](run_dir, self.run.config, seed) for name in self.run.loggers]
+            self._checkpoints = Checkpoints(run_dir / "checkpoints", run.settings.keep_checkpoints)
+            for seed in run.seeds:
+                self._loggers[seed] = [LOGGERS[name](run_dir, run.config, seed) for name in run.settings.loggers]
 
     def close(self) -> None:
-        """Waits for what is being written."""
+        """Save the best states, wait until all files are on disk, and plot the curve."""
         if self._checkpoints:
             if self._best:
                 self._save(self._best)
@@ -157,16 +69,16 @@ class Recorder:
             logger.close()
         self._loggers = {}
         if self.run.run_dir and self.rows:
-            draw_curve(self.run, self.rows)
+            plot_curve(self.run, self.rows)
 
     def record(
         self, start: int, wall_seconds: float, metrics: dict[str, np.ndarray], states: TrainState | None
     ) -> None:
-        """Metrics [seeds, updates] of the updates from `start` on; `states` before them, if they may be saved."""
+        """Record metrics [seeds, updates] of the updates from `start` on; `states` before them may be saved."""
         evaluation = {name: x[:, 0] for name, x in metrics.items() if name.startswith("eval/")}
         training = {name: x for name, x in metrics.items() if name not in evaluation and name != "is_finite"}
         is_evaluated = start % self.run.experiment.eval_every == 0
-        record = self._to_continue(wall_seconds)
+        record = self._resume_record(wall_seconds)
         self._since_evaluation = {name: self._since_evaluation.get(name, []) for name in training}
         if is_evaluated:
             self._add_rows(start, wall_seconds, evaluation)
@@ -181,8 +93,8 @@ class Recorder:
     def finish(
         self, update: int, wall_seconds: float, states: TrainState, evaluation: dict[str, np.ndarray] | None
     ) -> None:
-        """Saves the states in which training ends; metrics [seeds] of their evaluation, if it has reached its end."""
-        record = self._to_continue(wall_seconds)
+        """Save the final states; `evaluation` holds metrics [seeds] of them if training reached its end."""
+        record = self._resume_record(wall_seconds)
         if evaluation is not None:
             self._add_rows(update, wall_seconds, evaluation)
         if self._checkpoints:
@@ -191,16 +103,21 @@ class Recorder:
             self.save()
 
     def save(self) -> None:
-        """Writes the best states, if they are not on disk, and the last ones."""
+        """Write the best states, if they are not on disk yet, and the latest ones."""
         for candidate in (self._best, self._last):
             if candidate:
                 self._save(candidate)
         self._best = None
 
     def latest_return(self) -> float | None:
-        """Median over the seeds of the last evaluation."""
+        """Return the median over seeds of the latest evaluation, `None` without one."""
         latest = [row[RETURN] for row in self.rows if row["update"] == self.rows[-1]["update"]]
         return float(np.median(latest)) if latest else None
+
+    @property
+    def diverged(self) -> list[int]:
+        """Seeds that are frozen because they diverged; `reason` says how each of them did."""
+        return list(self.reason)
 
     def _note_diverged(self, start: int, metrics: dict[str, np.ndarray]) -> None:
         for index, seed in enumerate(self.run.seeds):
@@ -209,23 +126,19 @@ class Recorder:
                 of_update = {name: x[index, wrong[0]] for name, x in metrics.items()}
                 self.reason[seed] = _reason(of_update, start + int(wrong[0]))
 
-    @property
-    def diverged(self) -> list[int]:
-        """Seeds that stay as they were before their numbers stopped being finite, for a `reason` each."""
-        return list(self.reason)
-
     def _score(self, evaluation: dict[str, np.ndarray]) -> float | None:
-        """Mean return over the seeds that have not diverged."""
+        """Return the mean return over the seeds that have not diverged."""
         returns = [x for seed, x in zip(self.run.seeds, evaluation[RETURN], strict=True) if seed not in self.reason]
         score = float(np.mean(returns, dtype=float)) if returns else math.nan
         return score if math.isfinite(score) else None
 
-    def _to_continue(self, wall_seconds: float) -> dict[str, Any]:
+    def _resume_record(self, wall_seconds: float) -> dict[str, Any]:
+        """Return what resuming needs besides the training state."""
         diverged = {str(seed): reason for seed, reason in self.reason.items()}
         return {"wall_seconds": wall_seconds, "since_evaluation": self._since_evaluation, "diverged": diverged}
 
     def _add_rows(self, update: int, wall_seconds: float, evaluation: dict[str, np.ndarray]) -> None:
-        """Evaluations of the policies at `update`, and means over the updates since the rows before."""
+        """Add a row per seed: its evaluation at `update`, and means over the updates since the previous row."""
         for index, seed in enumerate(self.run.seeds):
             if seed not in self.reason and not np.isfinite(evaluation[RETURN][index]):
                 self.reason[seed] = f"{RETURN} is {evaluation[RETURN][index]} at update {update}"
@@ -238,18 +151,21 @@ class Recorder:
                 "wall_seconds": wall_seconds,
                 "seed": seed,
             }
-            self.rows.append(row | {name: float(x[index]) for name, x in evaluation.items()} | means)
-            if self.run.run_dir:
-                files.append_row(self.run.run_dir / "metrics.csv", self.rows[-1])
-            for logger in self._loggers.get(seed, []):
-                logger.log(self.rows[-1])
+            self._add_row(row | {name: float(x[index]) for name, x in evaluation.items()} | means)
         self._since_evaluation = {name: [] for name in self._since_evaluation}
-        if self.run.run_dir and self.rows and time.monotonic() - self._last_drawn >= SECONDS_PER_CURVE:
-            draw_curve(self.run, self.rows)
-            self._last_drawn = time.monotonic()
+        if self.run.run_dir and self.rows and time.monotonic() - self._last_plotted >= SECONDS_PER_CURVE:
+            plot_curve(self.run, self.rows)
+            self._last_plotted = time.monotonic()
+
+    def _add_row(self, row: Row) -> None:
+        self.rows.append(row)
+        if self.run.run_dir:
+            files.append_row(self.run.run_dir / "metrics.csv", row)
+        for logger in self._loggers.get(row["seed"], []):
+            logger.log(row)
 
     def _consider(self, candidate: _Candidate) -> None:
-        """Remembers the states as the last ones, and as the best ones if they are."""
+        """Keep the states as the latest ones, and as the best ones if their score is the highest."""
         assert self._checkpoints
         best_score = self._best.score if self._best else self._checkpoints.best_score
         if candidate.score is not None and (best_score is None or candidate.score > best_score):
@@ -261,15 +177,15 @@ class Recorder:
         self._checkpoints.save(candidate.update, candidate.states, candidate.record, candidate.score)
 
 
-def draw_curve(run: Run, rows: Sequence[Row]) -> None:
-    """Draws the learning curve of a run into its folder."""
+def plot_curve(run: Run, rows: Sequence[Row]) -> None:
+    """Plot the learning curve of a run into its folder."""
     assert run.run_dir
     title = f"{type(run.experiment.task).__name__}, {run.experiment.task.num_agents} agents"
     training_curve.draw_curve(run.run_dir / "curve.png", rows, title)
 
 
 def _reason(metrics: dict[str, Any], update: int) -> str:
-    """Which number stopped being finite."""
+    """Name the number that is not finite."""
     for name, value in metrics.items():
         if not np.isfinite(value) and is_loss(name):
             return f"{name} is {value} at update {update}"

@@ -1,4 +1,4 @@
-"""Trained policies, read from run folders: networks and their parameters, without all else that a run goes on with."""
+"""Trained policies, read from run folders: networks and their parameters, without the rest of the training state."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,46 +8,46 @@ import jax
 import numpy as np
 
 from jaxswarm import config as configs
-from jaxswarm.config import Config, ConfigError
+from jaxswarm.config import Config, ConfigError, RunSettings
 from jaxswarm.host.checkpoint import restore
-from jaxswarm.host.fit import abstract_state
-from jaxswarm.host.recorder import has_checkpoint
+from jaxswarm.host.ensemble import abstract_state
+from jaxswarm.host.run import has_checkpoint
 from jaxswarm.training import Experiment
 
 
-class Policies(NamedTuple):
-    """An experiment with the parameters that several seeds of it have come to, and where in the run that was."""
+class TrainedPolicies(NamedTuple):
+    """The policies of several seeds of an experiment, and the update that they were saved at."""
 
     experiment: Experiment
     params: Any  # leaves [seeds, ...]
     update: int
-    score: float | None  # mean evaluation return in training, if they were evaluated
-    diverged: dict[int, str]  # reasons, of those of the seeds that have
+    score: float | None  # mean evaluation return during training; `None`: this update was not evaluated
+    diverged: dict[int, str]  # reasons, for those of the seeds that have diverged
 
 
 def load(
     run_dir: str | Path, which: Literal["best", "last"] = "best", seed: int | None = None
 ) -> tuple[Experiment, Any]:
-    """The experiment of a run folder and the parameters of its policy, of one seed (`None`: the first).
+    """Load the experiment of a run folder and the parameters of its policy, of one seed (`None`: the first).
 
-    Of several seeds that were trained side by side, "best" is where the mean of their returns was highest.
+    If a run has several seeds, "best" is the update at which the mean of their returns was highest.
 
         experiment, params = jaxswarm.load("runs/NAME")
         distribution = experiment.network.apply(params, experiment.task.observe(state), method="policy")
 
-    Raises `ConfigError` for what is no run folder, has no checkpoint or not this seed, and `CheckpointError` where no
-    checkpoint can be restored. Skips damaged ones, and says so.
+    Raises a `ConfigError` if the folder is no run folder, has no checkpoint or not this seed, and a `CheckpointError`
+    if no checkpoint can be restored. Damaged checkpoints are skipped, and each is reported with one line.
     """
     config = configs.load(Path(run_dir) / "config.yaml")
-    trained = configs.run_settings(config).seeds
-    policies = read(Path(run_dir), config, which, trained[:1] if seed is None else [seed])
+    seeds = configs.run_settings(config).seeds
+    policies = load_policies(Path(run_dir), config, which, seeds[:1] if seed is None else [seed])
     return policies.experiment, jax.tree.map(lambda x: x[0], policies.params)
 
 
-def warm_start(settings: configs.RunSettings, run_dir: Path) -> Any:
-    """The parameters that `init_from` asks for; `None` without it, or where the run folder has a checkpoint.
+def warm_start(settings: RunSettings, run_dir: Path) -> Any:
+    """Load the parameters that `init_from` names; `None` without it, or if the run folder has a checkpoint.
 
-    Errors are those of `load`.
+    Raises the errors of `load`.
     """
     if settings.init_from is None or has_checkpoint(run_dir):
         return None
@@ -56,14 +56,14 @@ def warm_start(settings: configs.RunSettings, run_dir: Path) -> Any:
     return load(settings.init_from)[1]
 
 
-def read(
+def load_policies(
     run_dir: Path,
     config: Config,
     which: Literal["best", "last"],
     seeds: Sequence[int],
     warn: Callable[[str], Any] = print,
-) -> Policies:
-    """The policies of these seeds from the run folder with this config; errors are those of `load`."""
+) -> TrainedPolicies:
+    """Load the policies of these seeds from the run folder with this config; raises the errors of `load`."""
     experiment, trained = configs.build(config), configs.run_settings(config).seeds
     missing = [seed for seed in seeds if seed not in trained]
     if missing:
@@ -75,4 +75,4 @@ def read(
     wanted = np.array([trained.index(seed) for seed in seeds])
     params = jax.tree.map(lambda x: x[wanted], restored.train_state["learner"]["params"])
     diverged = {int(seed): reason for seed, reason in restored.record.get("diverged", {}).items() if int(seed) in seeds}
-    return Policies(experiment, params, restored.update, restored.score, diverged)
+    return TrainedPolicies(experiment, params, restored.update, restored.score, diverged)

@@ -1,1 +1,1 @@
-"""How bodies move, collide and find each other: the physics below the tasks."""
+"""Physics of the tasks: motion of agents, rigid-body collisions, and neighbor search."""

@@ -1,4 +1,7 @@
-"""Pictures of policies at work: one offline page, a strip, a moving picture. Viewers know scenes, not tasks."""
+"""Replays of policies as an offline HTML page, a strip of frames, an animation or a video.
+
+Viewers depend on scenes, not on tasks.
+"""
 
 import html
 import os
@@ -39,12 +42,15 @@ FORMATS: dict[str, Callable[..., None]] = {
     ".gif": pictures.write_gif,
     ".mp4": pictures.write_mp4,
 }
-# What `write` may be told of each format, whole numbers from 1
+# Options of `write` for each format; their values are integers >= 1
 OPTIONS = {".html": (), ".png": ("frames", "until"), ".gif": ("frames", "until"), ".mp4": ("until",)}
 
 
 def check(path: Path, **options: int) -> None:
-    """Raises a `RenderError` for what `write` could not do, before any time is spent on films."""
+    """Check that `write` can write to `path` with these options, before films are recorded.
+
+    Raises a `RenderError` for an unknown suffix, an option that does not fit the suffix, or a missing ffmpeg.
+    """
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise RenderError(f"out: must end in one of {', '.join(FORMATS)}, got {str(path)!r}")
@@ -57,7 +63,11 @@ def check(path: Path, **options: int) -> None:
 
 
 def write(path: str | Path, films: Sequence[Film], **options: int) -> None:
-    """Writes films in the format of the suffix, as a whole or not at all; the options are in `OPTIONS`."""
+    """Write films to a file in the format of its suffix.
+
+    `OPTIONS` lists the options of each format. The file is replaced atomically. Raises a `RenderError` if the file
+    cannot be written in this format; see `check`.
+    """
     path = Path(path)
     check(path, **options)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,23 +80,29 @@ def write(path: str | Path, films: Sequence[Film], **options: int) -> None:
 
 
 def iframe(films: Sequence[Film], *, height: int = 760) -> str:
-    """The page inside of HTML, for notebooks: `IPython.display.HTML(iframe(films))`; `height` in pixels."""
+    """Return the page as an HTML iframe for notebooks: `IPython.display.HTML(iframe(films))`.
+
+    `height` is in pixels.
+    """
     style = "width: 100%; max-width: 1000px; border: 0"
     return f'<div><iframe srcdoc="{html.escape(page.html(films))}" height="{height}" style="{style}"></iframe></div>'
 
 
 def describe(task: Any) -> str:
-    """The task and the size of its swarm, for titles."""
+    """Return the name of the task and its number of agents, for titles."""
     return f"{type(task).__name__.lower()} of {task.num_agents} agents"
 
 
 def of_seed(params: Any, index: int) -> Any:
-    """The parameters of one of the seeds that were trained side by side."""
+    """Select the parameters of one of several vectorized seeds, leaves [seeds, ...]."""
     return jax.tree.map(lambda leaf: leaf[index], params)
 
 
 def write_replay(run_dir: Path, experiment: Any, params: Any, *, update: int, name: str = "replay.html") -> Path | None:
-    """An episode of a policy as a page in the run folder; `None` after a warning, as no training is to fail by it."""
+    """Record an episode of a policy and write it as a page in the run folder.
+
+    Returns the path of the page. A failure must not stop training: it prints a warning and returns `None`.
+    """
     try:
         title = f"{describe(experiment.task)}, after update {update}"
         write(run_dir / name, [record(experiment.task, experiment.network, params, title=title)])
@@ -97,9 +113,10 @@ def write_replay(run_dir: Path, experiment: Any, params: Any, *, update: int, na
 
 
 def hook(run_dir: Path, experiment: Any, render_every: int) -> Callable[[int, Any], None]:
-    """What `fit` calls at evaluations; of each `render_every`-th it writes a replay of the first seed's policy.
+    """Return a callback for `fit` that writes a replay of the first seed's policy at some evaluations.
 
-    The first evaluation, of the untrained policy, is one of these. The files are `replay-<update>.html`.
+    These are the first evaluation, of the untrained policy, and every `render_every`-th one after it. The files are
+    `replay-<update>.html` in the run folder.
     """
 
     def on_evaluation(update: int, params: Any) -> None:

@@ -1,4 +1,7 @@
-"""Films as pictures: strips of a few frames, and moving pictures. Drawn by Matplotlib, in the colors of the page."""
+"""Films as image files: strips of frames, GIF animations and MP4 videos.
+
+Matplotlib draws the frames in the colors of the HTML page.
+"""
 
 import math
 import shutil
@@ -14,24 +17,27 @@ from jaxswarm.render.film import LIGHT, Film
 from jaxswarm.scene import Bodies
 
 INK, QUIET, FAINT = "#1c2126", "#646b73", "#c3c7cb"
-STRIP_WIDTH, MOVING_WIDTH = 2.2, 3.6  # inches, of one picture
-STRIP_RESOLUTION, MOVING_RESOLUTION = 200, 100  # dots per inch
-GIF_RATE, MP4_RATE = 20, 30  # pictures per second
-GIF_COLOURS = 64
-POINT = 0.019  # radius of a point over the side of the world
-JUMP = 0.12  # over the side: who moves further in one step crossed a seam or was put there; no trail leads there
-KITE = np.array([[1.5, 0.0], [-1.0, 0.9], [-0.45, 0.0], [-1.0, -0.9]])  # over the radius, heading along x
+STRIP_WIDTH, VIDEO_WIDTH = 2.2, 3.6  # inches per frame
+STRIP_RESOLUTION, VIDEO_RESOLUTION = 200, 100  # dots per inch
+GIF_RATE, MP4_RATE = 20, 30  # frames per second
+GIF_COLORS = 64
+POINT_RADIUS = 0.019  # in units of the side of the world
+JUMP = 0.12  # in units of the side: longer moves in one step cross a seam or are a restart, and leave no trail
+KITE = np.array([[1.5, 0.0], [-1.0, 0.9], [-0.45, 0.0], [-1.0, -0.9]])  # in units of the radius, heading along x
 SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 CIRCLE = np.stack([np.cos(np.linspace(0, 2 * math.pi, 24)), np.sin(np.linspace(0, 2 * math.pi, 24))], -1)
 NOSE = np.array([[0.2, 0.16], [0.2, -0.16], [0.95, -0.16], [0.95, 0.16]])
 
 
 class RenderError(RuntimeError):
-    """A picture cannot be written; the message says why, and what would be possible."""
+    """Raised when a replay cannot be written; the message gives the cause and the possible options."""
 
 
 def write_strip(path: Path, films: Sequence[Film], *, frames: int = 6, until: int | None = None) -> None:
-    """Pictures in a row, a row for each film, of evenly spaced steps from the first to `until`, or the end."""
+    """Write a PNG image with one row of `frames` evenly spaced frames per film.
+
+    The frames are between the first step and the step `until`, or the end of the longest film.
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     steps = _steps(films, frames, until)
@@ -47,23 +53,29 @@ def write_strip(path: Path, films: Sequence[Film], *, frames: int = 6, until: in
 
 
 def write_gif(path: Path, films: Sequence[Film], *, frames: int = 150, until: int | None = None) -> None:
-    """A moving picture of evenly spaced steps, and less where there are fewer; all have one palette, and no dither."""
+    """Write a GIF animation of at most `frames` evenly spaced frames up to the step `until`.
+
+    All frames share one palette and are not dithered, which keeps the file small.
+    """
     from PIL import Image  # noqa: PLC0415
 
     steps = _steps(films, frames, until)
-    images = [Image.fromarray(picture) for picture in _moving(films, steps)]
+    images = [Image.fromarray(frame) for frame in _video_frames(films, steps)]
     few = images[:: max(len(images) // 4, 1)]
     sample = Image.fromarray(np.concatenate([np.asarray(image) for image in few], 1))
-    palette = sample.quantize(GIF_COLOURS, dither=Image.Dither.NONE)
+    palette = sample.quantize(GIF_COLORS, dither=Image.Dither.NONE)
     first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    duration = [1000 // GIF_RATE] * len(rest) + [1500]  # the end stands still before it starts again
+    duration = [1000 // GIF_RATE] * len(rest) + [1500]  # ms; the last frame stays longer before the loop restarts
     first.save(path, format="GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
 
 
 def write_mp4(path: Path, films: Sequence[Film], *, until: int | None = None) -> None:
-    """Every step, by ffmpeg."""
+    """Write an MP4 video of every step up to the step `until`, encoded by ffmpeg.
+
+    Raises a `RenderError` if ffmpeg is missing or fails.
+    """
     steps = _steps(films, max(film.num_frames for film in films), until)
-    width, height = round(MOVING_WIDTH * len(films) * MOVING_RESOLUTION), _moving_height()
+    width, height = round(VIDEO_WIDTH * len(films) * VIDEO_RESOLUTION), _video_height()
     source = f"-f rawvideo -pixel_format rgb24 -video_size {width}x{height} -framerate {MP4_RATE} -i -"
     target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart -f mp4"
     command = [find_ffmpeg(), "-y", "-loglevel", "error", *source.split(), *target.split(), str(path)]
@@ -71,26 +83,26 @@ def write_mp4(path: Path, films: Sequence[Film], *, until: int | None = None) ->
         assert process.stdin
         assert process.stderr
         try:
-            for picture in _moving(films, steps):
-                process.stdin.write(picture.tobytes())
+            for frame in _video_frames(films, steps):
+                process.stdin.write(frame.tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            pass  # it says below what was wrong
-        said = process.stderr.read().decode(errors="replace")
+            pass  # ffmpeg has failed, and its message is read below
+        message = process.stderr.read().decode(errors="replace")
     if process.returncode:
-        raise RenderError(f"ffmpeg could not write {path}: {said.strip()}")
+        raise RenderError(f"ffmpeg could not write {path}: {message.strip()}")
 
 
 def find_ffmpeg() -> str:
-    """Where ffmpeg is; a `RenderError` where it is not."""
+    """Return the path of ffmpeg; raises a `RenderError` if it is not installed."""
     ffmpeg = shutil.which("ffmpeg")
     if ffmpeg is None:
-        raise RenderError(".mp4 needs the program ffmpeg; install it, or write .html, .gif or .png")
+        raise RenderError("out: must end in .html, .gif or .png if ffmpeg is not installed, got .mp4")
     return ffmpeg
 
 
 def draw(axes: Any, film: Film, frame: int) -> None:
-    """One picture: the world, goals, trails, catches so far, and bodies."""
+    """Draw one frame: the world, goals, trails, catches so far, and bodies."""
     from matplotlib.patches import Circle  # noqa: PLC0415
 
     side = float(film.high[0] - film.low[0])
@@ -100,12 +112,12 @@ def draw(axes: Any, film: Film, frame: int) -> None:
         spine.set(color=FAINT if is_torus else QUIET, linewidth=0.8 if is_torus else 1.4)
         spine.set_linestyle((0, (4, 4)) if is_torus else "solid")
     if film.scenes.goals:
-        for place, group in zip(film.scenes.goals.position[0], film.scenes.goals.group[0], strict=True):
+        for position, group in zip(film.scenes.goals.position[0], film.scenes.goals.group[0], strict=True):
             color = LIGHT["groups"][group % 4]
-            axes.add_patch(Circle(place, 0.17 * side, facecolor=color + "33", edgecolor=color, linewidth=1))
+            axes.add_patch(Circle(position, 0.17 * side, facecolor=color + "33", edgecolor=color, linewidth=1))
     for role, bodies in film.scenes.kinds.items():
         _draw_trails(axes, film, role, bodies, frame)
-    past = [place for when, place in film.catches if when <= frame]
+    past = [position for catch_frame, position in film.catches if catch_frame <= frame]
     if past:
         axes.scatter(*np.transpose(past), s=26, marker="x", color=LIGHT["caught"], linewidth=1.8, zorder=4)
     for role, bodies in reversed(film.scenes.kinds.items()):
@@ -113,7 +125,7 @@ def draw(axes: Any, film: Film, frame: int) -> None:
 
 
 def _draw_trails(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -> None:
-    """Lines through the steps before, the older the fainter."""
+    """Draw lines through the preceding positions; older lines are fainter."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415
     from matplotlib.colors import to_rgb  # noqa: PLC0415
 
@@ -124,7 +136,7 @@ def _draw_trails(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
     is_drawn = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=-1) < JUMP * side
     is_drawn &= bodies.is_present[start:frame]
     age = np.broadcast_to((frame - np.arange(start, frame))[:, None], is_drawn.shape)
-    rgb = np.array([to_rgb(color) for color in _colours(role, bodies, frame)])
+    rgb = np.array([to_rgb(color) for color in _colors(role, bodies, frame)])
     rgb = np.broadcast_to(rgb, (*is_drawn.shape, 3))
     alpha = 0.1 + 0.7 * (1 - age / (film.trail + 1)) ** 2
     rgba = np.concatenate([rgb, alpha[..., None]], -1)
@@ -132,51 +144,54 @@ def _draw_trails(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -
 
 
 def _draw_bodies(axes: Any, film: Film, role: str, bodies: Bodies, frame: int) -> None:
-    """Points that look somewhere are arrowheads, others discs; boxes have as many dots as tell their group in print."""
+    """Draw points with a heading as arrowheads, other agents as discs, and boxes as squares.
+
+    Boxes have dots that show their group in black-and-white prints.
+    """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
 
-    side, crowd = float(film.high[0] - film.low[0]), math.sqrt(20 / max(20, film.scenes.num_bodies))
-    size = float(bodies.size[frame]) * (0.5 if role == "boxes" else 1.0) or POINT * crowd * side
+    side, shrink = float(film.high[0] - film.low[0]), math.sqrt(20 / max(20, film.scenes.num_bodies))
+    size = float(bodies.size[frame]) * (0.5 if role == "boxes" else 1.0) or POINT_RADIUS * shrink * side
     is_pointed = bodies.heading is not None and not bodies.size[frame]
     outline = SQUARE if role == "boxes" else KITE if is_pointed else CIRCLE
     is_present = bodies.is_present[frame]
-    place = bodies.position[frame][is_present]
-    heading = np.zeros(len(place)) if bodies.heading is None else bodies.heading[frame][is_present]
-    colors = np.array(_colours(role, bodies, frame))[is_present]
-    shapes = list(_placed(outline, place, heading, size))
+    position = bodies.position[frame][is_present]
+    heading = np.zeros(len(position)) if bodies.heading is None else bodies.heading[frame][is_present]
+    colors = np.array(_colors(role, bodies, frame))[is_present]
+    shapes = list(_place(outline, position, heading, size))
     axes.add_collection(PolyCollection(shapes, facecolors=colors, edgecolors="white", linewidths=0.5, zorder=3))
     if role == "agents" and not is_pointed:
-        noses = list(_placed(NOSE, place, heading, size))
+        noses = list(_place(NOSE, position, heading, size))
         axes.add_collection(PolyCollection(noses, facecolors="white", zorder=3))
     if role == "boxes" and bodies.group is not None and bodies.group[frame].any():
-        dots = _dots(bodies.group[frame][is_present], place, size)
+        dots = _dots(bodies.group[frame][is_present], position, size)
         axes.add_collection(PolyCollection(dots, facecolors=INK, zorder=3))
 
 
-def _placed(
+def _place(
     outline: Float[np.ndarray, "points 2"],
-    place: Shaped[np.ndarray, "n 2"],
+    position: Shaped[np.ndarray, "n 2"],
     heading: Shaped[np.ndarray, " n"],
     size: float,
 ) -> Shaped[np.ndarray, "n points 2"]:
-    """An outline at many places."""
+    """Scale an outline, and turn and move it to each heading and position."""
     cos, sin = np.cos(heading), np.sin(heading)
-    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-    return place[:, None] + size * np.einsum("nij,pj->npi", turn, outline)
+    rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    return position[:, None] + size * np.einsum("nij,pj->npi", rotation, outline)
 
 
-def _dots(group: Shaped[np.ndarray, " n"], place: Shaped[np.ndarray, "n 2"], size: float) -> list[np.ndarray]:
-    """One dot for boxes of group 0, two for those of group 1, ..., side by side."""
-    middles = [
-        at + np.array([(dot - number / 2) * 0.5 * size, 0.0])
-        for at, number in zip(place, group, strict=True)
+def _dots(group: Shaped[np.ndarray, " n"], position: Shaped[np.ndarray, "n 2"], size: float) -> list[np.ndarray]:
+    """Return the outlines of dots in a row: one dot for a box of group 0, two for a box of group 1, and so on."""
+    centers = [
+        box + np.array([(dot - number / 2) * 0.5 * size, 0.0])
+        for box, number in zip(position, group, strict=True)
         for dot in range(number + 1)
     ]
-    return [middle + 0.15 * size * CIRCLE for middle in middles]
+    return [center + 0.15 * size * CIRCLE for center in centers]
 
 
-def _colours(role: str, bodies: Bodies, frame: int) -> list[str]:
-    """Of each body."""
+def _colors(role: str, bodies: Bodies, frame: int) -> list[str]:
+    """Return the color of each body."""
     if role != "boxes":
         return [LIGHT[role]] * bodies.position.shape[1]
     groups = np.zeros(bodies.position.shape[1], int) if bodies.group is None else bodies.group[frame]
@@ -184,25 +199,25 @@ def _colours(role: str, bodies: Bodies, frame: int) -> list[str]:
 
 
 def _steps(films: Sequence[Film], number: int, until: int | None) -> list[int]:
-    """Evenly spaced, the first and the last included; no step twice."""
+    """Return at most `number` evenly spaced distinct steps, including the first and the last."""
     last = max(film.num_frames for film in films) - 1
     last = min(until, last) if until else last
     return sorted({round(x) for x in np.linspace(0, last, min(number, last + 1))})
 
 
-def _moving_height() -> int:
-    return round((MOVING_WIDTH + 0.3) * MOVING_RESOLUTION)
+def _video_height() -> int:
+    return round((VIDEO_WIDTH + 0.3) * VIDEO_RESOLUTION)
 
 
-def _moving(films: Sequence[Film], steps: Sequence[int]) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Pictures of films side by side, with step and return above; width and height are even."""
+def _video_frames(films: Sequence[Film], steps: Sequence[int]) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Yield images of films side by side, with step and return above; width and height are even."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(MOVING_WIDTH * len(films), MOVING_WIDTH + 0.3), dpi=MOVING_RESOLUTION)
+    figure = Figure(figsize=(VIDEO_WIDTH * len(films), VIDEO_WIDTH + 0.3), dpi=VIDEO_RESOLUTION)
     canvas = FigureCanvasAgg(figure)
     grid = figure.subplots(1, len(films), squeeze=False)[0]
-    low, high = 0.02, 1 - 0.3 / (MOVING_WIDTH + 0.3)
+    low, high = 0.02, 1 - 0.3 / (VIDEO_WIDTH + 0.3)
     figure.subplots_adjust(left=0.02 / len(films), right=1 - 0.02 / len(films), bottom=low, top=high, wspace=0.04)
     for step in steps:
         for film, axes in zip(films, grid, strict=True):

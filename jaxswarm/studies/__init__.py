@@ -1,1 +1,1 @@
-"""Many runs: grids of settings and searches with Optuna."""
+"""Studies of many runs: grids of settings, and searches with Optuna."""

@@ -1,4 +1,7 @@
-"""Many experiments, a run folder for each: numbers side by side in one program, structure one program after another."""
+"""Grids of experiments, each with its own run folder.
+
+Runs that differ only in numeric hyperparameters are vectorized in one program; other programs run one after another.
+"""
 
 import csv
 import dataclasses
@@ -15,19 +18,22 @@ from jaxswarm import config as configs
 from jaxswarm.analysis import run_folders as folders
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.files import RETURN, Row, replace_text
-from jaxswarm.studies.trials import Trial
+from jaxswarm.host.run import Run
 
 RANGE = re.compile(r"(?P<low>[^,]+?)\.\.(?P<high>[^,:]+):(?P<count>\d+) ?(?P<log>log)?$")
 
 
 def expand(overrides: Sequence[str]) -> list[Config]:
-    """The config of every combination of the values of words like `key=a,b` or `key=1e-4..1e-3:5 log`."""
+    """Return the config of every combination of values in overrides such as `key=a,b` or `key=1e-4..1e-3:5 log`."""
     combinations = configs.combinations([_listed(word) for word in overrides])
     return [configs.compose_pairs(pairs) for pairs in combinations]
 
 
-def trials(wanted: Sequence[Config], sweep_dir: Path) -> list[Trial]:
-    """A trial for each config, with a folder that is named by what it does not share with the others."""
+def runs(wanted: Sequence[Config], sweep_dir: Path) -> list[Run]:
+    """Return a run for each config. Its folder is named by the settings that differ between the configs.
+
+    Raises a `ConfigError` if two configs differ only in settings that are not compared, such as the seed.
+    """
     experiments = [configs.build(config) for config in wanted]
     labels = folders.label([folders.fields(config) for config in wanted]) if len(wanted) > 1 else ["run"]
     width = len(str(len(wanted) - 1))
@@ -37,43 +43,44 @@ def trials(wanted: Sequence[Config], sweep_dir: Path) -> list[Trial]:
     ]
     if len(set(labels)) < len(labels):
         names = ", ".join(sorted(folders.NOT_COMPARED))
-        accepted = "other values of other keys, and num_seeds=N for N seeds"
+        accepted = "values of other keys, or num_seeds=N to train N seeds"
         raise ConfigError(f"two runs of the sweep differ only in {names}; give {accepted}")
     return [
-        Trial(config, experiment, sweep_dir / name)
+        Run(experiment, configs.run_settings(config), sweep_dir / name, config)
         for config, experiment, name in zip(wanted, experiments, names, strict=True)
     ]
 
 
-def programs(sweep: Sequence[Trial]) -> list[list[Trial]]:
-    """Trials that share a program: those that differ in nothing that fixes a shape, or how they are trained."""
+def programs(sweep: Sequence[Run]) -> list[list[Run]]:
+    """Group runs that share a compiled program: they differ only in numeric hyperparameters and seeds."""
 
-    def program(trial: Trial) -> tuple:
-        settings = dataclasses.replace(trial.settings, seed=0)
-        return jax.tree.structure(trial.experiment), trial.num_updates, settings
+    def program(run: Run) -> tuple:
+        settings = dataclasses.replace(run.settings, seed=0)
+        return jax.tree.structure(run.experiment), run.num_updates, settings
 
-    grouped: dict[Any, list[Trial]] = {}
-    for trial in sweep:
-        grouped.setdefault(program(trial), []).append(trial)
+    grouped: dict[Any, list[Run]] = {}
+    for run in sweep:
+        grouped.setdefault(program(run), []).append(run)
     return list(grouped.values())
 
 
-def summary(sweep: Sequence[Trial], rows: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
-    """Of each trial the return at its end: median and quartiles over the seeds that reached it; those without a seed
-    that diverged first, of these the best.
+def summary(sweep: Sequence[Run], rows: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
+    """Return a table of the final return of each run: median and quartiles over the seeds that reached the end.
+
+    Runs are sorted by the number of seeds that diverged, lowest first, and then by the median, highest first.
     """
     table = []
-    for trial, of_trial in zip(sweep, rows, strict=True):
-        final = [row[RETURN] for row in of_trial if row["update"] == trial.num_updates]
+    for run, of_run in zip(sweep, rows, strict=True):
+        final = [row[RETURN] for row in of_run if row["update"] == run.num_updates]
         low, median, high = np.percentile(final, [25, 50, 75]) if final else [np.nan] * 3
         numbers = {"median": float(median), "q25": float(low), "q75": float(high)}
-        counts = {"seeds": len(final), "diverged": trial.settings.num_seeds - len(final)}
-        table.append({"run": trial.run_dir.name} | numbers | counts)
+        counts = {"seeds": len(final), "diverged": run.settings.num_seeds - len(final)}
+        table.append({"run": run.folder.name} | numbers | counts)
     return sorted(table, key=lambda line: (line["diverged"], -np.nan_to_num(line["median"], nan=-np.inf)))
 
 
 def write_summary(path: Path, table: Sequence[dict[str, Any]]) -> None:
-    """The table as CSV."""
+    """Write the table of `summary` as CSV."""
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, list(table[0]), lineterminator="\n")
     writer.writeheader()
@@ -82,7 +89,7 @@ def write_summary(path: Path, table: Sequence[dict[str, Any]]) -> None:
 
 
 def _listed(word: str) -> str:
-    """A range as the list of its numbers."""
+    """Return an override with its range, if any, replaced by the list of the numbers."""
     key, equals, value = word.partition("=")
     found = RANGE.fullmatch(value)
     if not (equals and found):
@@ -92,7 +99,7 @@ def _listed(word: str) -> str:
         if count < 2 or (found["log"] and min(low, high) <= 0):
             raise ValueError
     except ValueError:
-        accepted = "low..high:count or low..high:count log, with count from 2 and, for log, numbers above 0"
+        accepted = "low..high:count or 'low..high:count log' with count >= 2 and, for log, positive numbers"
         raise ConfigError(f"{key}: must be {accepted}, got {value!r}") from None
     numbers = np.geomspace(low, high, count) if found["log"] else np.linspace(low, high, count)
     is_integer = all(float(x).is_integer() for x in (low, high)) and all(abs(x - round(x)) < 1e-9 for x in numbers)

@@ -1,7 +1,7 @@
-"""Search for good settings with Optuna, by any number of processes that share a storage.
+"""Search for good settings with Optuna. Any number of processes can share a storage.
 
-Each trial is a run folder, trained over several seeds side by side. Its value is the mean of all evaluation returns
-during training, over seeds: what the thesis maximized, which rewards good results and getting there soon.
+Each trial is a run folder with several seeds, which are vectorized. The value of a trial is the mean of all evaluation
+returns during training, over all seeds. The thesis maximized the same value, which rewards good and fast learning.
 """
 
 import math
@@ -20,14 +20,18 @@ if TYPE_CHECKING:
     import optuna
 
 BATCH_SIZE = "learner.batch_size"
-REQUEUED = "requeued"  # a trial that was cut off, and will be continued as another one
-RUN_DIR = "run_dir"
+RESUMES = "resumes"  # attribute of a trial that resumes an interrupted one: the number of that trial
+REQUEUED = "requeued"  # attribute that version 0.1 gave interrupted trials instead
+RUN_DIR = "run_dir"  # attribute of a trial: its run folder
 
-Space = dict[str, Any]  # what may be chosen for each key
+Space = dict[str, Any]  # the choice for each key: a list of values or a range
 
 
 def load_space(name: str, config: Config) -> Space:
-    """The space of a file in `configs/search`, or at a path, for the aggregator of the config."""
+    """Load the search space of a file in `configs/search`, or at a path, for the aggregator of the config.
+
+    Raises a `ConfigError` for an unknown name or an invalid file.
+    """
     shipped = {path.stem: path for path in (configs.config_dir() / configs.SEARCHES).glob("*.yaml")}
     path = shipped.get(name, Path(name))
     if not path.is_file():
@@ -45,23 +49,27 @@ def load_space(name: str, config: Config) -> Space:
 
 
 def open_study(storage: str, name: str = "jaxswarm") -> "optuna.Study":
-    """The study in a storage: a database's URL, or the path of a journal file that machines may share."""
+    """Open or create the study in a storage: the URL of a database, or the path of a journal file.
+
+    Machines can share either. Raises a `ConfigError` if Optuna is missing or the storage cannot be opened.
+    """
     try:
         import optuna  # noqa: PLC0415
         from optuna.storages.journal import JournalFileBackend  # noqa: PLC0415
     except ImportError as error:
-        raise ConfigError('search needs a package: pip install "jaxswarm[search]"') from error
+        raise ConfigError('search needs Optuna; install it with: pip install "jaxswarm[search]"') from error
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
-        where = storage if "://" in storage else optuna.storages.JournalStorage(JournalFileBackend(storage))
-        return optuna.create_study(storage=where, study_name=name, direction="maximize", load_if_exists=True)
+        opened = storage if "://" in storage else optuna.storages.JournalStorage(JournalFileBackend(storage))
+        return optuna.create_study(storage=opened, study_name=name, direction="maximize", load_if_exists=True)
     except Exception as error:
-        raise ConfigError(f"storage = {storage} cannot be opened: {' '.join(str(error).split())[:200]}") from error
+        reason = " ".join(str(error).split())[:200]
+        raise ConfigError(f"storage: must be a database URL or a journal file, got {storage!r} ({reason})") from error
 
 
 def ask(study: "optuna.Study", seed: int) -> "optuna.Trial":
-    """The next trial. Its number, which no other process gets, tells what is drawn for it."""
+    """Return the next trial. Its number is unique among all processes and seeds the sampler of its settings."""
     import optuna  # noqa: PLC0415
 
     trial = study.ask()
@@ -70,21 +78,23 @@ def ask(study: "optuna.Study", seed: int) -> "optuna.Trial":
 
 
 def num_started(study: "optuna.Study") -> int:
-    """Trials that were begun, by any process, and were not cut off."""
+    """Return the number of trials that any process has started. Interrupted trials do not count."""
     trials = study.get_trials(deepcopy=False)
-    return sum(trial.state.name != "WAITING" and REQUEUED not in trial.user_attrs for trial in trials)
+    interrupted = _interrupted(trials)
+    return sum(trial.state.name != "WAITING" and trial.number not in interrupted for trial in trials)
 
 
 def requeue(study: "optuna.Study", trial_number: int) -> None:
-    """Lets a trial that was cut off be continued by whoever comes next."""
-    trial = study.get_trials(deepcopy=False)[trial_number]
-    study.enqueue_trial(trial.params, user_attrs={RUN_DIR: trial.user_attrs[RUN_DIR]})
-    study._storage.set_trial_user_attr(trial._trial_id, REQUEUED, True)
+    """Enqueue an interrupted trial again; the next process that asks for a trial resumes it in the same run folder."""
+    trials = study.get_trials(deepcopy=False)
+    trial = trials[trial_number]
+    if trial_number not in _interrupted(trials):
+        study.enqueue_trial(trial.params, user_attrs={RUN_DIR: trial.user_attrs[RUN_DIR], RESUMES: trial_number})
     study.tell(trial_number, state=_state("FAIL"))
 
 
 def requeue_killed(study: "optuna.Study", sweep_dir: Path) -> None:
-    """`requeue` for trials in this folder that a process left when it was killed; nobody else may work there."""
+    """Requeue the trials in this folder whose process was killed. No other process may use the folder."""
     for trial in study.get_trials(deepcopy=False):
         run_dir = trial.user_attrs.get(RUN_DIR)
         if trial.state.name == "RUNNING" and run_dir and Path(run_dir).parent == sweep_dir.resolve():
@@ -92,7 +102,7 @@ def requeue_killed(study: "optuna.Study", sweep_dir: Path) -> None:
 
 
 def suggest(trial: "optuna.Trial", space: Space, pairs: Sequence[tuple[str, Any]]) -> Config:
-    """The config of a trial; `pairs` are what the command line says, and win."""
+    """Return the config of a trial. `pairs` are the overrides of the command line, which take precedence."""
     composed, groups = configs.compose_pairs(pairs), configs.choices()
     given = {configs.full_key(key, composed) for key, _ in pairs if key not in groups}
     chosen = [(key, _suggest(trial, key, choice)) for key, choice in space.items() if key not in given]
@@ -107,23 +117,32 @@ def suggest(trial: "optuna.Trial", space: Space, pairs: Sequence[tuple[str, Any]
 
 
 def value(rows: Sequence[Row], seeds: Sequence[int], num_evaluations: int) -> float:
-    """Mean over as many evaluations of all seeds; NaN without any. A seed that diverged has its worst from there on."""
+    """Return the mean over `num_evaluations` evaluations of each seed; NaN without any.
+
+    The missing evaluations of a seed that diverged count as its worst one, or as the worst of all seeds if it has none.
+    """
     if not rows:
         return math.nan
     worst = min(row[RETURN] for row in rows)
     returns = []
     for seed in seeds:
-        mine = [row[RETURN] for row in rows if row["seed"] == seed]
-        returns += mine + [min(mine, default=worst)] * (num_evaluations - len(mine))
+        of_seed = [row[RETURN] for row in rows if row["seed"] == seed]
+        returns += of_seed + [min(of_seed, default=worst)] * (num_evaluations - len(of_seed))
     return float(np.mean(returns))
 
 
 def tell(study: "optuna.Study", trial: "optuna.Trial", found: float) -> None:
-    """Ends a trial; one without a finite value has failed."""
+    """Finish a trial with its value; a trial without a finite value has failed."""
     if math.isfinite(found):
         study.tell(trial, found)
     else:
         study.tell(trial, state=_state("FAIL"))
+
+
+def _interrupted(trials: "Sequence[optuna.trial.FrozenTrial]") -> set[int]:
+    """Return the numbers of the trials that other trials resume."""
+    resumed = {trial.user_attrs[RESUMES] for trial in trials if RESUMES in trial.user_attrs}
+    return resumed | {trial.number for trial in trials if REQUEUED in trial.user_attrs}
 
 
 def _state(name: str) -> "optuna.trial.TrialState":
@@ -147,14 +166,14 @@ def _suggest(trial: "optuna.Trial", key: str, choice: Any) -> Any:
 
 
 def _check(key: str, choice: Any) -> None:
-    """Raises a `ConfigError` for what is not a choice."""
+    """Raise a `ConfigError` if the choice is neither a list nor a valid range."""
     if not ((isinstance(choice, list) and choice) or _is_range(choice, {"log", "step", "layers", "last"})):
-        accepted = "a list, or numbers low and high and if wanted log (from above 0), step, layers: [least, most], last"
+        accepted = "a list, or numbers low <= high, with optional keys log (low > 0), step, layers: [min, max], last"
         raise ConfigError(f"{key}: must be {accepted}, got {choice}")
 
 
 def _is_range(choice: Any, more: set[str]) -> bool:
-    """Whether it has numbers low <= high, and of `more` nothing that cannot be."""
+    """Return whether a choice has numbers low <= high, and of the optional keys `more` only valid ones."""
 
     def is_number(x: Any) -> bool:
         return isinstance(x, int | float) and not isinstance(x, bool)

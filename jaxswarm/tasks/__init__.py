@@ -1,4 +1,4 @@
-"""The tasks, by name."""
+"""Registry of tasks: `TASKS` maps the name of a task to its class."""
 
 from jaxswarm.tasks.boxes import Assembly, Clustering
 from jaxswarm.tasks.pursuit import Pursuit

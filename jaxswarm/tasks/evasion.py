@@ -1,4 +1,4 @@
-"""Where an evader flees: as the Voronoi edge that it shares with the nearest pursuer tells (Zhou et al., 2016)."""
+"""Flight direction of an evader, from the Voronoi edge that it shares with the nearest pursuer (Zhou et al., 2016)."""
 
 from functools import partial
 
@@ -8,10 +8,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxswarm.physics.geometry import Space, Torus, norm, unit
 
-MAX_SEEN = 10  # pursuers that an evader heeds, on a torus copies of pursuers
+MAX_SEEN = 10  # nearest pursuers that an evader considers; on a torus, each copy of a pursuer counts
 
 
-@partial(jax.jit, inline=True)  # so that steps outside of any other `jit` are fast, too
+@partial(jax.jit, inline=True)  # steps outside of other compiled functions must be fast, too
 def evader_direction(
     space: Space,
     evader: Float[Array, "2"],
@@ -19,17 +19,17 @@ def evader_direction(
     is_present: Bool[Array, " pursuers"],
     radius: Float[Array, ""] | float,
 ) -> Float[Array, "2"]:
-    """Unit vector in which an evader flees from its 10 nearest pursuers, of those that are within `radius`.
+    """Return the unit vector along which an evader flees from its 10 nearest pursuers within `radius`.
 
-    With xi the vector to the nearest pursuer, h its direction, v = h turned left, the points xi / 2 + t v are as far
-    from one as from the other. Of these, t_lo <= t <= t_hi are in the world and not closer to any other pursuer: the
-    edge. The evader's Voronoi cell shrinks least along
+    Let xi be the vector to the nearest pursuer, h its direction, and v = h turned left. The points xi / 2 + t v are
+    equally far from the evader and this pursuer. The points with t_lo <= t <= t_hi are inside the world and not closer
+    to another pursuer: they form the Voronoi edge. The evader's Voronoi cell shrinks least along
 
         u = -|xi| h + (t_lo + t_hi) v
 
-    A torus is taken as in the thesis's program: the evader's copy nearest the middle of the square of 2 x 2 worlds, in
-    which each pursuer has four copies. Pursuers at one distance count as one of the 10. Zero if nobody is in sight, or
-    a pursuer is at the evader's very place, or closer than 1e-15.
+    A torus is treated as in the thesis's program, as a square of 2 x 2 worlds with four copies of each pursuer. The
+    evader is its copy nearest to the middle of that square. Pursuers at equal distances count as one of the 10.
+    The result is zero if no pursuer is visible, or if a pursuer is closer than 1e-15. Lengths are in world units.
     """
     x, y, low, high = _surroundings(space, evader, pursuers)
     square = jax.lax.stop_gradient(x * x + y * y)
@@ -41,10 +41,10 @@ def evader_direction(
     xi = jnp.where(is_fleeing, jnp.stack([x[nearest], y[nearest]]), 1.0)
     h = unit(xi, norm(xi))
     v = jnp.stack([-h[1], h[0]])
-    # Another one, o, is farther where 2 o.(xi / 2 + t v) < o.o, which is 2 (o - xi).v t < o.(o - xi).
+    # Another pursuer o is farther away where 2 o.(xi / 2 + t v) < o.o, that is 2 (o - xi).v t < o.(o - xi).
     beyond_x, beyond_y = x - xi[0], y - xi[1]
     slope, offset = 2 * (beyond_x * v[0] + beyond_y * v[1]), x * beyond_x + y * beyond_y
-    is_other = is_near & (square <= _last_seen(square)) & (index != nearest)
+    is_other = is_near & (square <= _tenth_smallest(square)) & (index != nearest)
     cell_lo, cell_hi = _interval(slope, offset, is_other)
     side_slope, side_offset = jnp.concatenate([v, -v]), jnp.concatenate([high - xi / 2, xi / 2 - low])
     side_lo, side_hi = _interval(side_slope, side_offset, jnp.ones(4, bool))
@@ -53,7 +53,7 @@ def evader_direction(
 
 
 def _surroundings(space: Space, evader: Array, pursuers: Array) -> tuple[Array, Array, Array, Array]:
-    """x and y of pursuers, or of their copies, and the corners of the box that they are in; relative to the evader."""
+    """Return x and y of pursuers or their copies, and the corners of their square, relative to the evader."""
     x, y = (pursuers - evader[None]).T
     if not isinstance(space, Torus):
         return x, y, -evader, space.side - evader
@@ -63,8 +63,8 @@ def _surroundings(space: Space, evader: Array, pursuers: Array) -> tuple[Array, 
     return x.reshape(-1), y.reshape(-1), -evader - shift, 2 * space.side - evader - shift
 
 
-def _last_seen(square: Float[Array, "n"]) -> Float[Array, ""]:
-    """The tenth smallest number, by ten passes, which take a third of the time of `top_k` on CPU."""
+def _tenth_smallest(square: Float[Array, "n"]) -> Float[Array, ""]:
+    """Return the tenth smallest distinct number; ten passes take a third of the time of `top_k` on CPU."""
 
     def next_larger(_: object, bound: Array) -> Array:
         return jnp.where(square > bound, square, jnp.inf).min()
@@ -73,7 +73,7 @@ def _last_seen(square: Float[Array, "n"]) -> Float[Array, ""]:
 
 
 def _interval(slope: Float[Array, "n"], offset: Float[Array, "n"], is_bound: Bool[Array, "n"]) -> tuple[Array, Array]:
-    """Lowest and highest t with slope t <= offset for all that bind; 0 is among them."""
+    """Return the lowest and highest t with slope t <= offset for all bounds; t = 0 satisfies them all."""
     is_sloped = is_bound & (jnp.abs(slope) > 1e-12)
     t = offset / jnp.where(is_sloped, slope, 1.0)
     t_lo = jnp.where(is_sloped & (slope < 0), t, -jnp.inf).max()

@@ -1,4 +1,4 @@
-"""Pursuit: agents are to catch evaders that are twice as fast as they are."""
+"""Pursuit: agents must catch evaders that are twice as fast as they are."""
 
 import dataclasses
 import math
@@ -19,39 +19,39 @@ from jaxswarm.tasks.evasion import evader_direction
 from jaxswarm.tasks.swarm import NumberRange
 from jaxswarm.types import Entities, Key, Metrics, Observation, Step, pytree, static
 
-EVADER_STRIDE = 2.0  # world units in one step, twice what a pursuer can do
+EVADER_STRIDE = 2.0  # world units per step, twice the stride of a pursuer
 CATCH_DISTANCE = {"distance": 1.0, "catches": 2.0}  # world units
-WALL_LOW, WALL_HIGH = 1.0, 99.0  # beyond these is "at a wall", whatever the side: so in the thesis's program
+WALL_LOW, WALL_HIGH = 1.0, 99.0  # agents beyond these are "at a wall" for every side, as in the thesis's program
 
 
 @pytree
 class State:
-    """One world."""
+    """State of one environment."""
 
     position: Float[Array, "agents 2"]  # world units, in [0, side]
     heading: Float[Array, "agents"]  # rad, counter-clockwise from x
     velocity: Float[Array, "agents 2"]  # linear speed in world units / s, turn rate in rad / s
-    rounding: Float[Array, "agents 5"]  # see `dynamics`
-    evader_position: Float[Array, "evaders 2"]
-    evader_age: Int[Array, " evaders"]  # steps since the evader was put where it started
-    catches: Int[Array, ""]  # so far
-    active_agents: Int[Array, ""]  # the first ones take part; the others do not exist
-    active_evaders: Int[Array, ""]
+    rounding: Float[Array, "agents 5"]  # float32 rounding errors, see `physics.dynamics`
+    evader_position: Float[Array, "evaders 2"]  # world units, in [0, side]
+    evader_age: Int[Array, " evaders"]  # steps since the evader was last placed
+    catches: Int[Array, ""]  # number of catches since reset
+    active_agents: Int[Array, ""]  # the first agents are active; the others do not exist
+    active_evaders: Int[Array, ""]  # the first evaders are active; the others do not exist
     time: Int[Array, ""]  # steps since reset
 
 
 @pytree
 class Agents:
-    """What is known of each agent by itself."""
+    """Quantities of each agent that the observations of all agents share."""
 
-    position: Float[Array, "agents 2"]
+    position: Float[Array, "agents 2"]  # world units
     direction: Float[Array, "agents 2"]  # [cos, sin] of the heading
     own: Float[Array, "agents own_dim"]
 
 
 @pytree
 class View(swarm.View):
-    """What `perceive` needs of a state."""
+    """Part of a state that `perceive` needs."""
 
     evader_position: Float[Array, "evaders 2"]
     active_evaders: Int[Array, ""]
@@ -59,15 +59,31 @@ class View(swarm.View):
 
 @pytree
 class Pursuit:
-    """The pursuits of the thesis (sections 5.2.2 and 5.2.3).
+    """Pursuit tasks of the thesis (sections 5.2.2 and 5.2.3): agents catch evaders that flee from visible agents.
 
-    With `reward="distance"` it is the distance of the pursuer that is nearest to an evader, and an evader caught (at 1
-    unit) ends the episode. With `"catches"` every evader caught (at 2 units) gives 1 and starts anew somewhere else.
-    Evaders flee from those that they see within `evader_visibility_radius`, which is also how far they are seen.
-    Numbers of agents and evaders are drawn for each episode within `active_agents` and `active_evaders`, if given.
-    With `max_neighbors` agents perceive their nearest neighbors only, in O(num_agents) memory (see `neighbors`).
-    Without `torus` agents know whether they are at a wall: a coordinate up to 1 or from 99 on, as in the thesis's
-    program, also where `side` is not 100.
+    With the reward "distance", a catch (within 1 world unit) ends the episode. With "catches", evaders that are caught
+    (within 2 world units) restart at random positions. `max_neighbors` suits large swarms that see a small part of the
+    world: observations then need O(num_agents) memory (see `physics.neighbors`).
+
+    Without `torus`, agents observe whether they are at a wall: a coordinate is <= 1 or >= 99. As in the thesis's
+    program, these limits do not depend on `side`. In Python, `null` is `None`.
+
+    Attributes:
+        num_agents: An environment has this number of agents, an integer >= 1.
+        num_evaders: An environment has this number of evaders, an integer >= 1.
+        active_agents: The number of active agents in each episode is drawn from [low, high]; with null all are active.
+        active_evaders: The number of active evaders in each episode is drawn from [low, high]; with null all are
+            active.
+        side: The sides of the square world have this length in world units.
+        torus: Agents that leave the square enter it on the opposite side if true; if false, the sides are walls.
+        visibility_radius: Agents see each other within this distance in world units; 100 * sqrt(2) sees all of a
+            world of side 100.
+        evader_visibility_radius: Agents and evaders see each other within this distance in world units.
+        max_neighbors: Agents perceive at most this number of their nearest visible neighbors; with null they perceive
+            all of them.
+        reward: The reward is minus the smallest "distance" between an agent and an evader over
+            `evader_visibility_radius`, or the number of "catches".
+        episode_length: An episode is truncated after this number of steps of 0.1 s, an integer >= 1.
     """
 
     num_agents: int = static(default=10)
@@ -93,16 +109,19 @@ class Pursuit:
 
     @property
     def space(self) -> Space:
-        """Where distances are taken."""
+        """Space in which distances are measured."""
         return swarm.space(self)
 
     @property
     def motion(self) -> Velocity:
-        """How agents move."""
+        """Motion model of the agents."""
         return Velocity(max_turn_rate=2 * math.pi)
 
     def reset(self, key: Key) -> State:
-        """Agents and evaders anywhere but within a twentieth of the sides, agents looking anywhere."""
+        """Draw a start state: agents and evaders with uniform positions, agents with uniform headings.
+
+        Positions keep a distance of `side / 20` from the sides.
+        """
         position_key, heading_key, evader_key, agents_key, evaders_key = jax.random.split(key, 5)
         return State(
             position=swarm.draw_positions(position_key, self.side, self.num_agents),
@@ -118,13 +137,14 @@ class Pursuit:
         )
 
     def step(self, key: Key, state: State, action: Float[Array, "agents 2"]) -> tuple[State, Step]:
-        """One step of 0.1 s; the only thing random in it is where caught evaders start anew.
+        """Simulate one step of 0.1 s; `key` only draws the new positions of caught evaders.
 
-        1. "catches": evaders closer than 2 units to an agent after the last step are caught, and put anywhere.
-        2. Evaders move by 2 units, away from where the agents were.
+        1. "catches": evaders closer than 2 units to an agent after the last step are caught and placed at random.
+           The reward is their number.
+        2. Evaders move by 2 units, away from the previous positions of the agents.
         3. Agents move.
-        4. "distance": the reward is -min(d, R) / R, d the smallest distance of all, R = evader_visibility_radius; below
-           1 unit the evader is caught, and the task is over.
+        4. "distance": the reward is -min(d, R) / R, with d the smallest distance between an agent and an evader and
+           R = evader_visibility_radius. Below 1 unit the evader is caught and the episode terminates.
         """
         if self.reward == "catches":
             caught, age = self.is_caught(state), state.evader_age
@@ -142,14 +162,14 @@ class Pursuit:
         return state, Step(reward, is_solved, is_over & ~is_solved, metrics)
 
     def distances(self, state: State) -> Float[Array, "agents evaders"]:
-        """Between agents and evaders; infinite where one of the two does not take part."""
+        """Return the distances in world units; they are infinite for inactive agents and evaders."""
         distance = norm(self.space.displacement(state.position[:, None], state.evader_position[None]))
         is_agent = swarm.is_present(state.active_agents, self.num_agents)
         is_evader = swarm.is_present(state.active_evaders, self.num_evaders)
         return jnp.where(is_agent[:, None] & is_evader[None], distance, jnp.inf)
 
     def is_caught(self, state: State) -> Bool[Array, " evaders"]:
-        """Which evaders an agent is close enough to."""
+        """Mark evaders that are closer to an agent than the catch distance."""
         return (self.distances(state) < CATCH_DISTANCE[self.reward]).any(0)
 
     def _restart(self, key: Key, state: State, caught: Bool[Array, " evaders"]) -> State:
@@ -161,11 +181,12 @@ class Pursuit:
         )
 
     def _move(self, state: State, action: Float[Array, "agents 2"]) -> State:
-        """Evaders first, all from the same state, then agents."""
+        """Move the evaders, all from the same state, and then the agents."""
         is_present = swarm.is_present(state.active_agents, self.num_agents)
-        flee = jax.vmap(evader_direction, (None, 0, None, None, None))
-        way = flee(self.space, state.evader_position, state.position, is_present, self.evader_visibility_radius)
-        evader_position = self.space.confine(state.evader_position + EVADER_STRIDE * way)
+        escape = jax.vmap(evader_direction, (None, 0, None, None, None))(
+            self.space, state.evader_position, state.position, is_present, self.evader_visibility_radius
+        )
+        evader_position = self.space.confine(state.evader_position + EVADER_STRIDE * escape)
         state = self.motion.move(self.space, state, action)
         return dataclasses.replace(
             state, evader_position=evader_position, evader_age=state.evader_age + 1, time=state.time + 1
@@ -180,7 +201,7 @@ class Pursuit:
         return metrics | swarm.overflow(self.around(state), is_present, self.max_neighbors)
 
     def around(self, state: State) -> Neighborhood:
-        """Who is near each agent."""
+        """Return the number of visible neighbors, the sum of distances and the nearest neighbors of each agent."""
         is_present = swarm.is_present(state.active_agents, self.num_agents)
         return neighborhood(
             self.space,
@@ -192,7 +213,7 @@ class Pursuit:
         )
 
     def view(self, state: State) -> View:
-        """What `perceive` needs of a state, in O(agents) memory."""
+        """Return the part of a state that `perceive` needs, in O(agents) memory."""
         around = self.around(state)
         dtype = state.position.dtype
         own = [around.num_visible.astype(dtype) / jnp.maximum(state.active_agents - 1, 1)]
@@ -202,14 +223,15 @@ class Pursuit:
         return View(agents, state.active_agents, around.nearest, state.evader_position, state.active_evaders)
 
     def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
-        """What one agent perceives; its neighbors stand in cyclic order, from the agent after it on.
+        """Return the observation of one agent; neighbors are in cyclic order, starting with the agent after it.
 
-        Own features: fraction of the others that is visible; with walls also whether it is at one. Neighbours':
-        distance over visibility_radius, bearing to them and from them as [cos, sin]. Evaders': distance over
-        evader_visibility_radius, bearing to them. Those out of sight are masked, and zero.
+        Own features: fraction of the other agents that is visible and, in a world with walls, whether the agent is at
+        a wall. Neighbor features: distance over `visibility_radius`, bearing to the neighbor and from it as [cos, sin].
+        Evader features: distance over `evader_visibility_radius`, bearing to the evader as [cos, sin]. Invisible
+        neighbors and evaders are masked and have zero features.
         """
-        me, them, is_present = swarm.pick(view, agent)
-        distance, bearings = swarm.sight(self.space, me, them)
+        me, them, is_present = swarm.agent_and_others(view, agent)
+        distance, bearings = swarm.distance_and_bearings(self.space, me, them)
         neighbors = _entities(distance, bearings, self.visibility_radius, is_present)
         to_evaders = self.space.displacement(me.position, view.evader_position)
         distance = norm(to_evaders)
@@ -220,16 +242,16 @@ class Pursuit:
         return Observation(own=me.own[0], groups={"neighbors": neighbors, "evaders": evaders}, mask=is_active)
 
     def observe(self, state: State) -> Observation:
-        """What each agent perceives; see `perceive`."""
+        """Return the observations of all agents; `perceive` lists the features."""
         return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
 
     def slots(self, state: State) -> dict[str, Int[Array, "agents slots"]]:
-        """Which body of the scene is in which slot of `observe`; -1: none."""
+        """Return the number of the scene's body in each slot of `observe`; -1 marks an empty slot."""
         evaders = jnp.broadcast_to(self.num_agents + jnp.arange(self.num_evaders), (self.num_agents, self.num_evaders))
         return {"neighbors": swarm.slots(self.view(state)), "evaders": evaders}
 
     def scene(self, state: State) -> Scene:
-        """Points in a square; evaders are marked where they are caught, before they start anew."""
+        """Return the scene of a state: points in a square, with evaders marked as caught before they restart."""
         is_agent = swarm.is_present(state.active_agents, self.num_agents)
         is_evader = swarm.is_present(state.active_evaders, self.num_evaders)
         agents = Bodies(state.position, is_agent, state.heading, seen_within=self.visibility_radius)
@@ -238,7 +260,7 @@ class Pursuit:
 
 
 def _entities(distance: Array, bearings: Array, radius: Array | float, is_present: Array) -> Entities:
-    """Entities that are present and not farther than the radius."""
+    """Return the entities, with a mask of those that are present and not farther away than the radius."""
     mask = is_present & (distance <= radius)
     features = jnp.concatenate([distance[:, None] / radius, bearings], -1)
     return Entities(jnp.where(mask[:, None], features, 0.0), mask)

@@ -1,4 +1,4 @@
-"""Rendezvous: all agents are to meet at one place, which is not given."""
+"""Rendezvous: all agents must meet at one place that is not given."""
 
 import math
 from typing import ClassVar
@@ -19,40 +19,54 @@ from jaxswarm.types import Entities, Key, Observation, Step, pytree, static
 
 RELATIVE_VELOCITY = {
     "normalized": lambda difference, max_speed: difference / (2 * max_speed),  # in [-1, 1]
-    "thesis": lambda difference, max_speed: difference * (max_speed / 2),  # a slip of its program; in [-100, 100]
+    "thesis": lambda difference, max_speed: difference * (max_speed / 2),  # an error in its program; in [-100, 100]
 }
 
 
 @pytree
 class State:
-    """One world."""
+    """State of one environment."""
 
     position: Float[Array, "agents 2"]  # world units, in [0, side]
     heading: Float[Array, "agents"]  # rad, counter-clockwise from x
     velocity: Float[Array, "agents 2"]  # linear speed in world units / s, turn rate in rad / s
-    rounding: Float[Array, "agents 5"]  # see `dynamics`
-    active_agents: Int[Array, ""]  # the first ones take part; the others do not exist
+    rounding: Float[Array, "agents 5"]  # float32 rounding errors, see `physics.dynamics`
+    active_agents: Int[Array, ""]  # the first agents are active; the others do not exist
     time: Int[Array, ""]  # steps since reset
 
 
 @pytree
 class Agents:
-    """What is known of each agent by itself."""
+    """Quantities of each agent that the observations of all agents share."""
 
-    position: Float[Array, "agents 2"]
+    position: Float[Array, "agents 2"]  # world units
     direction: Float[Array, "agents 2"]  # [cos, sin] of the heading
-    velocity: Float[Array, "agents 2"]  # in world axes
-    num_visible: Float[Array, "agents 1"]
+    velocity: Float[Array, "agents 2"]  # in world axes, world units / s
+    num_visible: Float[Array, "agents 1"]  # number of visible neighbors
     own: Float[Array, "agents own_dim"]
 
 
 @pytree
 class Rendezvous:
-    """The rendezvous of the thesis (section 5.2.1); its figures used the defaults, but "thesis" relative velocities.
+    """Rendezvous task of the thesis (section 5.2.1): agents minimize their mean distance to each other.
 
-    With `active_agents` the number of agents of each episode is drawn between these two; `num_agents` is then the most
-    there can be. With `max_neighbors` agents perceive their nearest neighbors only, in O(num_agents) memory (see
-    `neighbors`).
+    The figures of the thesis used the defaults, but `relative_velocity="thesis"`. `max_neighbors` suits large swarms
+    that see a small part of the world: observations then need O(num_agents) memory (see `physics.neighbors`). In
+    Python, `null` is `None`.
+
+    Attributes:
+        num_agents: An environment has this number of agents, an integer >= 2.
+        active_agents: The number of active agents in each episode is drawn from [low, high]; with null all are active.
+        side: The sides of the square world have this length in world units.
+        torus: Agents that leave the square enter it on the opposite side if true; if false, the sides are walls.
+        visibility_radius: Agents see each other within this distance in world units; 100 * sqrt(2) sees all of a
+            world of side 100.
+        max_neighbors: Agents perceive at most this number of their nearest visible neighbors; with null they perceive
+            all of them.
+        dynamics: Actions set the "acceleration" or the "velocity" of the agents.
+        relative_velocity: Observed relative velocities are scaled to [-1, 1] ("normalized") or to [-100, 100]
+            ("thesis").
+        episode_length: An episode is truncated after this number of steps of 0.1 s, an integer >= 1.
     """
 
     num_agents: int = static(default=20)
@@ -74,16 +88,19 @@ class Rendezvous:
 
     @property
     def space(self) -> Space:
-        """Where distances are taken."""
+        """Space in which distances are measured."""
         return swarm.space(self)
 
     @property
     def motion(self) -> Acceleration | Velocity:
-        """How agents move."""
+        """Motion model that `dynamics` names."""
         return DYNAMICS[self.dynamics]()
 
     def reset(self, key: Key) -> State:
-        """Agents at rest anywhere but within a twentieth of the walls, looking anywhere."""
+        """Draw a start state: agents at rest, with uniform positions and headings.
+
+        Positions keep a distance of `side / 20` from the sides.
+        """
         position_key, heading_key, number_key = jax.random.split(key, 3)
         return State(
             position=swarm.draw_positions(position_key, self.side, self.num_agents),
@@ -95,11 +112,11 @@ class Rendezvous:
         )
 
     def step(self, key: Key, state: State, action: Float[Array, "agents 2"]) -> tuple[State, Step]:
-        """One step of 0.1 s; nothing in it is random.
+        """Simulate one step of 0.1 s. The step is deterministic and ignores `key`.
 
             reward = -mean_{i<j} min(d_ij, R) / R - 0.001 mean(action^2),  R = visibility_radius
 
-        after the move, of the action as given; the move clips it to [-1, 1].
+        Distances d_ij are those after the move. The move clips actions to [-1, 1], the reward uses unclipped actions.
         """
         state = self.motion.move(self.space, state, action).replace(time=state.time + 1)
         is_present = swarm.is_present(state.active_agents, self.num_agents)
@@ -119,39 +136,40 @@ class Rendezvous:
         return state, step
 
     def around(self, state: State) -> Neighborhood:
-        """Who is near each agent."""
+        """Return the number of visible neighbors, the sum of distances and the nearest neighbors of each agent."""
         is_present = swarm.is_present(state.active_agents, self.num_agents)
         return neighborhood(
             self.space, state.position, is_present, self.visibility_radius, self.is_visible, self.max_neighbors
         )
 
     def is_visible(self, distance: Float[Array, "*n"]) -> Array:
-        """An agent at exactly one's own place is not."""
+        """Mark visible neighbors by their distance in world units; an agent at the same place is not visible."""
         return (distance > 0) & (distance < self.visibility_radius)
 
     def view(self, state: State) -> View:
-        """What `perceive` needs of a state, in O(agents) memory."""
+        """Return the part of a state that `perceive` needs, in O(agents) memory."""
         around = self.around(state)
         num_visible = around.num_visible[:, None].astype(jnp.float32)
-        feeling = self.motion.proprioception(state.velocity)
+        own_motion = self.motion.proprioception(state.velocity)
         agents = Agents(
             position=state.position,
             direction=direction(state.heading),
             velocity=self.motion.world_velocity(state.heading, state.velocity),
             num_visible=num_visible,
-            own=jnp.concatenate([num_visible / jnp.maximum(state.active_agents - 1, 1), feeling], -1),
+            own=jnp.concatenate([num_visible / jnp.maximum(state.active_agents - 1, 1), own_motion], -1),
         )
         return View(agents, state.active_agents, around.nearest)
 
     def perceive(self, view: View, agent: Int[Array, ""]) -> Observation:
-        """What one agent perceives; its neighbors stand in cyclic order, from the agent after it on.
+        """Return the observation of one agent; neighbors are in cyclic order, starting with the agent after it.
 
-        Own features: fraction of the others that is visible, and the motion's proprioception. Neighbours': distance
-        over the square's diagonal, bearing to them and from them as [cos, sin], relative velocity (own - theirs) in
-        world axes, visible agents (theirs - own) over agents - 2. Those out of sight are masked, and zero.
+        Own features: fraction of the other agents that is visible, and the proprioception of the motion model.
+        Neighbor features: distance over the diagonal of the square, bearing to the neighbor and from it as [cos, sin],
+        relative velocity (own - neighbor's) in world axes, and the difference in the number of visible agents
+        (neighbor's - own) over the number of agents - 2. Invisible neighbors are masked and have zero features.
         """
-        me, them, is_present = swarm.pick(view, agent)
-        distance, bearings = swarm.sight(self.space, me, them)
+        me, them, is_present = swarm.agent_and_others(view, agent)
+        distance, bearings = swarm.distance_and_bearings(self.space, me, them)
         mask = is_present & self.is_visible(distance)
         features = [
             distance[:, None] / (self.side * math.sqrt(2)),
@@ -164,15 +182,15 @@ class Rendezvous:
         return Observation(own=me.own[0], groups={"neighbors": neighbors}, mask=is_active)
 
     def observe(self, state: State) -> Observation:
-        """What each agent perceives; see `perceive`."""
+        """Return the observations of all agents; `perceive` lists the features."""
         return jax.vmap(self.perceive, (None, 0))(self.view(state), jnp.arange(self.num_agents))
 
     def slots(self, state: State) -> dict[str, Int[Array, "agents slots"]]:
-        """Which body of the scene is in which slot of `observe`; -1: none."""
+        """Return the number of the scene's body in each slot of `observe`; -1 marks an empty slot."""
         return {"neighbors": swarm.slots(self.view(state))}
 
     def scene(self, state: State) -> Scene:
-        """Points in a square."""
+        """Return the scene of a state: points in a square."""
         is_present = swarm.is_present(state.active_agents, self.num_agents)
         agents = Bodies(state.position, is_present, state.heading, seen_within=self.visibility_radius)
         return Scene(jnp.zeros(2), jnp.full(2, self.side), self.torus, agents)

@@ -1,4 +1,4 @@
-"""What swarms of points have in common: how many take part, where they start, and who each of them looks at."""
+"""Functions shared by the tasks of point agents: active agents, start positions, and perceived neighbors."""
 
 from typing import Any
 
@@ -12,20 +12,23 @@ from jaxswarm.physics.geometry import Plane, Space, Torus, bearing, norm, unit_v
 from jaxswarm.physics.neighbors import Neighborhood
 from jaxswarm.types import Key, Metrics, pytree
 
-NumberRange = tuple[int, int]  # lowest and highest
+NumberRange = tuple[int, int]  # (low, high), both included
 
 
 @pytree
 class View:
-    """What is known of each agent by itself, so that pairs need no trigonometry and no other pairs."""
+    """Quantities computed once per agent, so that features of a pair need neither trigonometry nor other pairs."""
 
     agents: Any  # leaves [agents, ...], with at least `position` and `direction`
     active_agents: Int[Array, ""]
-    nearest: Int[Array, "agents max_neighbors"] | None  # whom to look at; None: at everybody
+    nearest: Int[Array, "agents max_neighbors"] | None  # perceived neighbors of each agent; None: all other agents
 
 
 def require_swarm(task: Any, least: int) -> None:
-    """Checks the fields that tasks of point swarms share."""
+    """Check the fields that tasks of point agents share; `least` is the smallest number of agents.
+
+    Raises a `ValueError` that names the field.
+    """
     require(task, checks.integer(least), "num_agents")
     require(task, checks.integer(1), "episode_length")
     require(task, checks.optional(checks.integer(1)), "max_neighbors")
@@ -35,29 +38,36 @@ def require_swarm(task: Any, least: int) -> None:
 
 
 def space(task: Any) -> Space:
-    """Where distances are taken."""
+    """Return the space in which the task measures distances."""
     return Torus(task.side) if task.torus else Plane(task.side)
 
 
 def draw_number(key: Key, bounds: NumberRange | None, most: int) -> Int[Array, ""]:
-    """How many take part in an episode: any number within the bounds, both included; without bounds, all."""
+    """Draw the number of active entities of an episode.
+
+    The number is uniform within `bounds`, both included. Without bounds it is `most`.
+    """
     if bounds is None:
         return jnp.array(most, jnp.int32)
     return jax.random.randint(key, (), bounds[0], bounds[1] + 1)
 
 
 def draw_positions(key: Key, side: float | Float[Array, ""], num_points: int) -> Float[Array, "points 2"]:
-    """Anywhere but within a twentieth of the sides."""
+    """Draw uniform positions, in world units, that keep a distance of `side / 20` from the sides."""
     return side * jax.random.uniform(key, (num_points, 2), minval=0.05, maxval=0.95)
 
 
 def is_present(active: Int[Array, ""], num_slots: int) -> Bool[Array, " slots"]:
-    """The first ones take part."""
+    """Mark the first `active` of `num_slots` slots."""
     return jnp.arange(num_slots) < active
 
 
 def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_neighbors: int | None) -> Metrics:
-    """How many visible neighbors agents do not perceive, on average, because there is room for so many only."""
+    """Return the metric `unseen_neighbors`, or no metric without `max_neighbors`.
+
+    The metric is the mean number of visible neighbors that an agent does not perceive because they exceed
+    `max_neighbors`.
+    """
     if max_neighbors is None:
         return {}
     missed = jnp.maximum(neighborhood.num_visible - max_neighbors, 0)
@@ -65,26 +75,26 @@ def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_ne
 
 
 def cyclic_others(agent: Int[Array, ""], num_agents: int) -> Int[Array, " others"]:
-    """All other agents in cyclic order, from the one after it on."""
+    """Return the indices of all other agents in cyclic order, starting with the agent after `agent`."""
     index = agent + jnp.arange(1, num_agents)
     return jnp.where(index < num_agents, index, index - num_agents)
 
 
 def others(view: View, agent: Int[Array, ""]) -> Int[Array, " others"]:
-    """Those whom `pick` gives, in its order; -1 where a list of the nearest ends early."""
+    """Return the indices of the agents that `agent_and_others` returns, in its order; -1 marks an empty slot."""
     return cyclic_others(agent, view.agents.position.shape[0]) if view.nearest is None else view.nearest[agent]
 
 
 def slots(view: View) -> Int[Array, "agents others"]:
-    """`others` of every agent."""
+    """Return `others` for every agent."""
     return jax.vmap(others, (None, 0))(view, jnp.arange(view.agents.position.shape[0]))
 
 
-def pick(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " others"]]:
-    """The agent, leaves [1, ...]; those it may see, leaves [others, ...]; and whether they take part.
+def agent_and_others(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " others"]]:
+    """Return the agent (leaves [1, ...]), the other agents (leaves [others, ...]) and a mask of active others.
 
-    Without a list of the nearest these are all others in cyclic order, from the agent after it on: slices of doubled
-    arrays, which are faster than a gather.
+    Without a list of nearest neighbors, the others are all other agents in cyclic order, starting with the agent after
+    `agent`. They are then slices of doubled arrays, which are faster than a gather.
     """
     num_agents = view.agents.position.shape[0]
 
@@ -99,10 +109,13 @@ def pick(view: View, agent: Int[Array, ""]) -> tuple[Any, Any, Bool[Array, " oth
     return window(agent, 1), window(agent + 1, num_agents - 1), index < view.active_agents
 
 
-def sight(space: Space, me: Any, them: Any) -> tuple[Float[Array, "others"], Float[Array, "others 4"]]:
-    """Distance; and bearing to them and from them, as [cos, sin] each. In one place, both see the other along x."""
+def distance_and_bearings(space: Space, me: Any, them: Any) -> tuple[Float[Array, "others"], Float[Array, "others 4"]]:
+    """Return the distance to each of `them`, and the bearings to and from them, as [cos, sin] each.
+
+    Two agents at the same place see each other in the direction of x.
+    """
     displacement = space.displacement(me.position, them.position)
     distance = norm(displacement)
     toward = unit_vector(displacement, distance)
-    back = jnp.where(distance[:, None] > 0, -toward, toward)
-    return distance, jnp.concatenate([bearing(me.direction, toward), bearing(them.direction, back)], -1)
+    backward = jnp.where(distance[:, None] > 0, -toward, toward)
+    return distance, jnp.concatenate([bearing(me.direction, toward), bearing(them.direction, backward)], -1)

@@ -1,0 +1,67 @@
+"""Settings of a run beyond its experiment."""
+
+import dataclasses
+import math
+from typing import Literal
+
+from jaxswarm.config.schema import ConfigError
+
+LENGTHS = ("num_updates", "total_agent_steps")  # two units for the length of a run
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+    """Settings of a run beyond its experiment: seeds, length, checkpoints, outputs, warm start and imports.
+
+    In Python, `null` is `None`. Raises a `ConfigError` for impossible values.
+
+    Attributes:
+        seed: All random numbers of the run are derived from this seed.
+        num_seeds: This number of seeds, counted up from `seed`, is trained in one program.
+        num_updates: The run has this number of updates; either this or total_agent_steps is null.
+        total_agent_steps: The run has this number of agent steps (environment steps times agents), rounded up to whole
+            updates; either this or num_updates is null.
+        checkpoint_seconds: Checkpoints are saved at most once in this number of seconds.
+        keep_checkpoints: This number of latest checkpoints is kept, in addition to the best one.
+        render_every: A replay page is written every time this number of evaluations is done; with null, it is written
+            once, at the end.
+        loggers: Metrics are also sent to these loggers: tensorboard, wandb.
+        init_from: Training starts from the best policy of this run folder (warm start); the task may differ in
+            numbers, for example in the number of agents.
+        imports: These Python files or modules are imported to register your own tasks, aggregators or learners.
+    """
+
+    seed: int = 0
+    num_seeds: int = 1
+    num_updates: int | None = None
+    total_agent_steps: int | None = None
+    checkpoint_seconds: float = 30.0
+    keep_checkpoints: int = 3
+    render_every: int | None = None
+    loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    init_from: str | None = None
+    imports: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.num_updates is None) == (self.total_agent_steps is None):
+            given = f"num_updates={self.num_updates}, total_agent_steps={self.total_agent_steps}"
+            raise ConfigError(f"length: must be given by one of num_updates and total_agent_steps, got {given}")
+        for field in dataclasses.fields(self):
+            name, value = field.name, getattr(self, field.name)
+            bound = 0 if name in ("seed", "checkpoint_seconds") else 1
+            if isinstance(value, int | float) and value < bound:
+                raise ConfigError(f"{name}: must be a number >= {bound}, got {value!r}")
+        if self.seed + self.num_seeds > 2**32:
+            raise ConfigError(f"seed: seed + num_seeds must be at most 2**32, got {self.seed} + {self.num_seeds}")
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds that are trained in one program."""
+        return tuple(range(self.seed, self.seed + self.num_seeds))
+
+    def length(self, agent_steps_per_update: int) -> int:
+        """Return the number of updates. `total_agent_steps` is rounded up to whole updates."""
+        if self.num_updates is not None:
+            return self.num_updates
+        assert self.total_agent_steps is not None
+        return math.ceil(self.total_agent_steps / agent_steps_per_update)

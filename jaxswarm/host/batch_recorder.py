@@ -1,0 +1,134 @@
+"""The results of all runs of one program: split among their recorders, timed, and reported."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxswarm.files import Row
+from jaxswarm.host import ensemble
+from jaxswarm.host.ensemble import RunBatch
+from jaxswarm.host.progress import Progress
+from jaxswarm.host.recorder import Recorder
+from jaxswarm.training import TrainState
+from jaxswarm.types import Metrics
+
+SECONDS_PER_CHUNK = 1.0  # target duration of a chunk, where single updates are faster
+
+
+class DivergedError(RuntimeError):
+    """All seeds of all runs have diverged (NaN or infinity); `rows` holds the evaluations of each run."""
+
+    def __init__(self, message: str, rows: Sequence[list[Row]]):
+        super().__init__(message)
+        self.rows = list(rows)
+
+
+class Chunk(NamedTuple):
+    """Updates that have been dispatched to the device."""
+
+    start: int  # updates done before
+    length: int
+    metrics: Metrics  # [runs, updates], on the device
+    states_before: TrainState | None  # if they may have to be saved
+    is_saved: bool
+
+
+class BatchRecorder:
+    """Pass the results of a batch to the recorder of each run, and measure time."""
+
+    def __init__(
+        self,
+        batch: RunBatch,
+        recorders: Sequence[Recorder],
+        progress: Progress,
+        start: int,
+        wall_seconds: float,
+        agree: Callable[..., list[int]],
+    ):
+        self.batch = batch
+        self.recorders = recorders
+        self.progress = progress
+        self.start = start
+        runs = [recorder.run for recorder in recorders]
+        self.needs_states = any(agree(*[bool(run.run_dir or run.on_evaluation) for run in runs]))
+        self._checkpoint_seconds = runs[0].settings.checkpoint_seconds
+        self._started = time.monotonic() - wall_seconds
+        self._wall_seconds = wall_seconds  # when the last recorded chunk was done
+        self._seconds_per_update: float | None = None
+        self._last_save = time.monotonic()
+        self._num_reported = 0
+
+    def open(self) -> None:
+        """Prepare all run folders."""
+        for recorder in self.recorders:
+            recorder.open()
+
+    def chunk_length(self) -> int:
+        """Return the number of updates that take about `SECONDS_PER_CHUNK`; 1 until their speed is known."""
+        if not self._seconds_per_update:
+            return 1
+        return max(1, int(SECONDS_PER_CHUNK / self._seconds_per_update))
+
+    def is_checkpoint_due(self) -> bool:
+        """Return whether the last checkpoint is at least `checkpoint_seconds` old."""
+        return time.monotonic() - self._last_save >= self._checkpoint_seconds
+
+    def record(self, chunk: Chunk) -> None:
+        """Wait for a chunk and record its results."""
+        metrics = jax.device_get(ensemble.fetch(self.batch, chunk.metrics))
+        metrics = {name: x[:, : chunk.length] for name, x in metrics.items()}
+        states = ensemble.fetch(self.batch, chunk.states_before)
+        for recorder, part in self._parts():
+            own = {name: x[part] for name, x in metrics.items()}
+            recorder.record(chunk.start, self._wall_seconds, own, _slice(states, part))
+            if chunk.is_saved:
+                recorder.save()
+        if chunk.is_saved:
+            self._last_save = time.monotonic()
+        self._report_diverged()
+        self._measure(chunk)
+        returns = [x for recorder in self.recorders if (x := recorder.latest_return()) is not None]
+        self.progress.advance(chunk.start + chunk.length, float(np.median(returns)) if returns else None)
+
+    def finish(self, update: int, states: TrainState, is_complete: bool) -> None:
+        """Save the final states, and evaluate them if training reached its end."""
+        evaluation = None
+        if is_complete:
+            evaluation = ensemble.fetch(self.batch, ensemble.evaluate_batch(self.batch, states))
+            evaluation = jax.device_get(evaluation)
+        states = ensemble.fetch(self.batch, states)
+        for recorder, part in self._parts():
+            own = None if evaluation is None else {name: x[part] for name, x in evaluation.items()}
+            recorder.finish(update, self._wall_seconds, _slice(states, part), own)
+        self._report_diverged()
+
+    def _measure(self, chunk: Chunk) -> None:
+        """Update the clock, and the speed from all chunks but the first, which includes compilation."""
+        now = time.monotonic() - self._started
+        if chunk.start > self.start:
+            self._seconds_per_update = (now - self._wall_seconds) / chunk.length
+        self._wall_seconds = now
+
+    def _parts(self) -> Iterator[tuple[Recorder, slice]]:
+        """Yield each recorder with its part of the runs axis."""
+        size = self.batch.num_runs // len(self.recorders)
+        for index, recorder in enumerate(self.recorders):
+            yield recorder, slice(index * size, (index + 1) * size)
+
+    def _report_diverged(self) -> None:
+        """Warn about seeds that have diverged since the last call; raise a `DivergedError` if no seed is left."""
+        diverged = [(recorder, seed) for recorder in self.recorders for seed in recorder.diverged]
+        if len(diverged) == self.batch.num_runs:
+            reason = diverged[-1][0].reason[diverged[-1][1]]
+            raise DivergedError(f"{reason}; training stopped", [recorder.rows for recorder in self.recorders])
+        for recorder, seed in diverged[self._num_reported :]:
+            where = f" of {recorder.run.run_dir}" if recorder.run.run_dir else ""
+            self.progress.warn(f"seed {seed}{where} diverged and is frozen: {recorder.reason[seed]}")
+        self._num_reported = len(diverged)
+
+
+def _slice(states: Any, part: slice) -> Any:
+    return jax.tree.map(lambda x: x[part], states)
