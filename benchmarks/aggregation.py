@@ -1,12 +1,12 @@
-"""How fast every aggregator is in every layout; one JSON line per combination.
+"""Speed of every aggregator in every layout; prints one JSON line per combination.
 
     python benchmarks/aggregation.py [aggregators=mean,max] [rows=4000] [slots=19] [features=64] [repeats=5] [out=FILE]
 
-A network encodes the 8 features of each entity (one layer), aggregates, and decodes (one layer); times are minima over
-the repeats, of the output and of the output with its gradient with respect to all parameters. All combinations of one
-size take turns within a repeat, so that their ratios are of the same minutes, and so does the product of two
-2048 x 2048 matrices, whose speed says what the machine could do in them. Layout "chosen" is the one that training uses;
-the others are forced.
+A network encodes the 8 features of each entity (one layer), aggregates, and decodes (one layer). Times are minima over
+the repeats, for the output and for the output with its gradient with respect to all parameters. All combinations of one
+size take turns within a repeat, so that their ratios do not depend on the load of the machine. The product of two
+2048 x 2048 matrices takes part, too; its speed shows what the machine can reach at that time. Training uses the layout
+"chosen"; the others are forced.
 """
 
 import itertools
@@ -40,15 +40,17 @@ class Network(nn.Module):
 
     @nn.compact
     def __call__(self, own, group):
-        is_raw = self.aggregator.num_encoders == 0
-        encoder = ParallelEncoders(()) if is_raw else Encoder((self.width,), "leaky_relu", self.aggregator.num_parts)
+        has_encoder = self.aggregator.num_encoders > 0
+        encoder = (
+            Encoder((self.width,), "leaky_relu", self.aggregator.num_parts) if has_encoder else ParallelEncoders(())
+        )
         aggregator = self.aggregator.copy(name="pooling")
-        pool = sets.Pool(aggregator, (encoder,), DIM if is_raw else self.width, self.layout)
+        pool = sets.Pool(aggregator, (encoder,), self.width if has_encoder else DIM, self.layout)
         return nn.leaky_relu(nn.Dense(self.width)(jnp.concatenate([own, pool((group,), own)], -1)))
 
 
 def programs(name, layout, rows, slots, width):
-    """Forward, and forward with gradient, compiled."""
+    """Return calls of the compiled output, and of the compiled output with its gradient."""
     model = Network(AGGREGATORS[name](), width, layout)
     keys = jax.random.split(jax.random.key(0), 3)
     group = Entities(jax.random.normal(keys[0], (rows, slots, DIM)), jnp.ones((rows, slots), bool))
@@ -65,7 +67,7 @@ def programs(name, layout, rows, slots, width):
 
 
 def minima(calls, repeats):
-    """Seconds of each call, after one that does not count; a call of less than 20 ms is repeated within its turn."""
+    """Return the least seconds of each call, after a warm-up; a call below 20 ms is repeated within its turn."""
     best = {}
     for repeat, (name, call) in itertools.product(range(repeats + 1), calls.items()):
         for _ in range(1 + int(0.02 / best.get(name, 1.0))):
@@ -77,7 +79,7 @@ def minima(calls, repeats):
 
 
 def measure(names, rows, slots, width, repeats):
-    """Results of all aggregators and layouts at one size."""
+    """Yield the results of all aggregators and layouts at one size."""
     matrix = jax.random.normal(jax.random.key(3), (2048, 2048))
     product = jax.jit(lambda x: x @ x)
     calls = {("gemm", "", ""): lambda: product(matrix)}

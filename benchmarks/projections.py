@@ -1,10 +1,11 @@
-"""What trust region layers cost, side by side in one process; prints one JSON object a line.
+"""Cost of trust region layers, measured in one process; prints one JSON object per line.
 
     python benchmarks/projections.py [rows=4096] [repeats=200] [out=FILE]
 
-`call`: microseconds of projecting a batch, and of its log-probability. `loss`: microseconds of loss and gradient of TRL
-and of PPO on the same batch, of outputs that are parameters themselves (so nothing hides the layer), and of the default
-network on observations of rendezvous. Every line has the ratio to what it is compared with.
+`call`: microseconds of projecting a batch, compared with its log-probability. `loss`: microseconds of loss and gradient
+of TRL, compared with PPO on the same batch. The losses are measured for outputs that are parameters themselves, so that
+nothing hides the cost of the layer, and for the default network on observations of rendezvous. Every line contains the
+ratios.
 """
 
 import sys
@@ -26,7 +27,7 @@ BOUNDS = {"mean_bound": 0.03, "cov_bound": 0.001}
 
 
 class Outputs:
-    """In place of a network: what it would put out are the parameters."""
+    """Network whose outputs are its parameters."""
 
     def __init__(self, std):
         self.std = std
@@ -37,7 +38,7 @@ class Outputs:
 
 
 def microseconds(functions: dict, repeats: int) -> dict[str, float]:
-    """Median time of a call of each, in turns, so that all see the same machine."""
+    """Return the median time of a call of each function; they take turns, so that all see the same machine load."""
     times = {name: [] for name in functions}
     for function, args in functions.values():
         jax.block_until_ready(function(*args))
@@ -50,7 +51,7 @@ def microseconds(functions: dict, repeats: int) -> dict[str, float]:
 
 
 def changed(num_rows: int, dim: int, is_shared: bool) -> tuple[dict, dict, Minibatch]:
-    """Outputs, old outputs, and a batch that the old ones took; nearly all rows are outside the bounds."""
+    """Return outputs, old outputs, and a batch sampled with the old ones; nearly all rows are outside the bounds."""
     keys = jax.random.split(jax.random.key(0), 7)
     stds = (1 if is_shared else num_rows, dim)
     old = {"mean": jax.random.normal(keys[0], (num_rows, dim)), "log_std": 0.3 * jax.random.normal(keys[1], stds)}
@@ -67,7 +68,7 @@ def changed(num_rows: int, dim: int, is_shared: bool) -> tuple[dict, dict, Minib
 
 
 def calls(num_rows: int, dim: int) -> dict:
-    """Log-probability and projections of state-dependent standard deviations."""
+    """Return the log-probability and the projections of state-dependent standard deviations, with arguments."""
     new, old, batch = changed(num_rows, dim, is_shared=False)
 
     def project(name, new, old):
@@ -81,7 +82,7 @@ def calls(num_rows: int, dim: int) -> dict:
 
 
 def losses(network, params: dict, batch: Minibatch) -> dict:
-    """Loss and gradient of PPO, and of TRL with every projection."""
+    """Return loss and gradient of PPO, and of TRL with every projection, with arguments."""
 
     def function(learner, *more):
         gradient = jax.jit(jax.value_and_grad(lambda *args: learner.loss(network, *args, *more), has_aux=True))
@@ -92,7 +93,7 @@ def losses(network, params: dict, batch: Minibatch) -> dict:
 
 
 def on_rendezvous(num_rows: int, std: str) -> tuple:
-    """The default network, its parameters, and a batch for it."""
+    """Return the default network, its parameters, and a batch for it."""
     experiment = config.build(config.compose([f"network.std={std}"]))
     task, network = experiment.task, experiment.network
     keys = jax.random.split(jax.random.key(1), -(-num_rows // task.num_agents))

@@ -1,6 +1,6 @@
 """Train cooperative swarms with deep reinforcement learning, as one compiled JAX program."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from etils import epy
 
@@ -12,6 +12,9 @@ with epy.lazy_api_imports(globals()):  # the command line answers before JAX is 
     from jaxswarm.networks import ActorCritic
     from jaxswarm.tasks import TASKS
     from jaxswarm.training import Experiment, TrainState, evaluate, init, train
+
+if TYPE_CHECKING:
+    from jaxswarm.tasks import Assembly, Clustering, Pursuit, Rendezvous
 
 __version__ = "0.1.0"
 
@@ -32,8 +35,8 @@ __all__ = [
 ]
 
 
-def experiment(*overrides: str) -> Any:
-    """The `Experiment` that these words of `jaxswarm-train` ask for; a `ConfigError` says what is wrong with them.
+def experiment(*overrides: str) -> "Experiment":
+    """Build the `Experiment` of these overrides of `jaxswarm-train`; raises a `ConfigError` for invalid overrides.
 
     experiment = jaxswarm.experiment("experiment=pursuit_best", "task.num_agents=20")
     """
@@ -42,8 +45,12 @@ def experiment(*overrides: str) -> Any:
     return config.build(config.compose(overrides))
 
 
-def make(name: str, **fields: Any) -> Any:
-    """The task of that name, `TASKS[name](**fields)`; a `ValueError` names what there is."""
+def make(name: str, **fields: Any) -> "Assembly | Clustering | Pursuit | Rendezvous":
+    """Build the task that is registered under this name, `TASKS[name](**fields)`.
+
+    The annotation lists the tasks of this package; a task that you register is built as well. Raises a `ValueError`
+    for an unknown name and for impossible values of fields.
+    """
     from jaxswarm.tasks import TASKS  # noqa: PLC0415
 
     if name not in TASKS:

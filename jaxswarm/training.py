@@ -1,7 +1,7 @@
-"""The whole training loop as one compiled program: rollouts, updates and evaluations.
+"""The whole training loop as a single compiled program: rollouts, updates and evaluations.
 
-`train` is a pure function of an experiment and a state, without host callbacks, so that `jax.vmap` runs it over seeds
-(states from several keys) and over every number of the experiment that fixes no shape.
+`train` is a pure function of an experiment and a state, without host callbacks. Therefore `jax.vmap` runs it over seeds
+(states from several keys) and over every numeric (traced) hyperparameter of the experiment.
 """
 
 import dataclasses
@@ -20,17 +20,28 @@ from jaxswarm.networks import ActorCritic
 from jaxswarm.rollout import Environments, PolicyFn
 from jaxswarm.types import Key, Metrics, pytree, static
 
-MAX_SAMPLES = 2**31 - 1  # of one update: int32 numbers them
+MAX_SAMPLES = 2**31 - 1  # of one update, whose samples are numbered by int32
 
 
 @pytree
 class Experiment:
-    """All that defines a run but its seed. One update takes `num_steps` steps in each of `num_envs` worlds.
+    """A training run without seed and length: task, network, learner, and the sizes of rollouts and evaluations.
 
-    Every `eval_every` updates, before the update, the deterministic policy plays one episode in each of `num_eval_envs`
-    separate worlds. With `desynchronized_start` each world begins at a random time of its first episode, so that
-    worlds do not move in lockstep. `reset_pool` start states are drawn per world and update; `None`: as many as whole
-    episodes begin in `num_steps`. Worlds of a task that ends early may need more; they use theirs again.
+    Fields that determine shapes are static. All other numbers are leaves, so `jax.vmap` can run over them.
+
+    Attributes:
+        task: Agents are trained on this task, an instance of a class in `TASKS` or of your own.
+        network: All agents use this policy and value network.
+        learner: The learner updates the parameters after each rollout.
+        num_envs: This number of environments is simulated in parallel.
+        num_steps: The rollout length: each update takes this number of steps in each environment.
+        num_eval_envs: An evaluation plays one episode of the deterministic policy in each of this number of separate
+            environments.
+        eval_every: The policy is evaluated before every update whose index is a multiple of this number.
+        desynchronized_start: Each environment starts at a random time of its first episode if true, so that
+            environments are not in lockstep; if false, all episodes start together.
+        reset_pool: This number of start states is drawn per environment and update; with null it is num_steps /
+            episode_length, rounded up. If more episodes start, because a task ends early, start states are used again.
     """
 
     task: Any
@@ -62,12 +73,12 @@ class Experiment:
 
     @property
     def num_start_states(self) -> int:
-        """Drawn per world and update."""
+        """Number of start states drawn per environment and update."""
         return self.reset_pool or math.ceil(self.num_steps / self.task.episode_length)
 
     @property
     def agent_steps_per_update(self) -> int:
-        """Environment steps of all agents in one update."""
+        """Agent steps of one update: environments times steps times agents."""
         return self.num_envs * self.num_steps * self.task.num_agents
 
 
@@ -77,18 +88,18 @@ def _has(part: Any, method: str) -> bool:
 
 @pytree
 class TrainState:
-    """All that changes during a run. Random numbers are functions of `key` and `update` alone."""
+    """Everything that changes during a run. All random numbers are functions of `key` and `update` alone."""
 
-    update: Int[Array, ""]  # updates done
+    update: Int[Array, ""]  # number of updates done
     key: Key
     learner: LearnerState
     envs: Environments
-    is_finite: Bool[Array, ""]  # False: numbers stopped being finite in the update after these, and the state stays
+    is_finite: Bool[Array, ""]  # False: the next update diverged, and this state is frozen
 
 
 @jax.jit
 def init(experiment: Experiment, key: Key) -> TrainState:
-    """State before the first update."""
+    """Return the state before the first update."""
     run_key, params_key, obs_key, envs_key = jax.random.split(key, 4)
     obs = experiment.task.observe(experiment.task.reset(obs_key))
     params = experiment.network.init(params_key, obs)
@@ -98,10 +109,10 @@ def init(experiment: Experiment, key: Key) -> TrainState:
 
 @partial(jax.jit, static_argnames="num_updates")
 def train(experiment: Experiment, train_state: TrainState, num_updates: int) -> tuple[TrainState, Metrics]:
-    """`num_updates` updates; the metrics have one row per update, NaN in `eval/...` where no evaluation was due.
+    """Run `num_updates` updates; metrics [num_updates], with NaN in `eval/...` if no evaluation was due.
 
-    Once a parameter, a loss or a return is not finite the state stays that before, and `is_finite` is 0 from there on.
-    n calls with 1 update give the same bits as 1 call with n.
+    When a parameter, a loss or an evaluation return is not finite, the state before that update is frozen, and the
+    metric `is_finite` is 0 from then on. n calls with 1 update give the same bits as 1 call with n updates.
     """
     return train_chunk(experiment, train_state, num_updates, num_updates)
 
@@ -109,7 +120,7 @@ def train(experiment: Experiment, train_state: TrainState, num_updates: int) -> 
 def train_chunk(
     experiment: Experiment, train_state: TrainState, num_updates: int | Int[Array, ""], size: int
 ) -> tuple[TrainState, Metrics]:
-    """`train` for a number of updates that is not known when compiling, at most `size`; the other rows are NaN."""
+    """Run at most `size` updates, a number that is traced; metrics [size], with NaN in the remaining rows."""
     shapes = jax.eval_shape(_evaluate_and_update, experiment, train_state)[1]
     rows = {name: jnp.full((size,), jnp.nan) for name in shapes}
 
@@ -117,21 +128,21 @@ def train_chunk(
         state, metrics = _evaluate_and_update(experiment, carry[0])
         return state, {name: carry[1][name].at[i].set(x) for name, x in metrics.items()}
 
-    # A trip count that XLA knows would let it compile single updates in another way, with other rounding.
+    # With a known trip count, XLA would compile single updates differently, with other rounding.
     num_updates = jax.lax.optimization_barrier(jnp.asarray(num_updates, jnp.int32))
     return jax.lax.fori_loop(0, num_updates, body, (train_state, rows))
 
 
 @jax.jit
 def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
-    """Evaluates the deterministic policy; the worlds depend on the number of updates done, not on the training."""
+    """Evaluate the deterministic policy; the start states depend on the number of updates only, not on training."""
     key = jax.random.fold_in(_update_key(train_state), 0)
     policy = _policy(experiment, train_state.learner)
     metrics = rollout.evaluate(key, experiment.task, policy, experiment.num_eval_envs)
     return {f"eval/{name}": x for name, x in metrics.items()}
 
 
-@jax.jit  # traced once, for its shapes and for the loop
+@jax.jit  # so that it is traced once, for its shapes and for the loop
 def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[TrainState, Metrics]:
     is_due = state.update % experiment.eval_every == 0
     eval_metrics = _evaluate_if(is_due, experiment, state)
@@ -157,19 +168,19 @@ def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[Tra
 
 
 def _are_finite(params: Any, metrics: Metrics) -> Bool[Array, ""]:
-    """Parameters and losses."""
+    """Return whether all parameters and losses are finite."""
     losses = {name: x for name, x in metrics.items() if is_loss(name)}
     checks = jax.tree.map(lambda x: jnp.isfinite(x).all(), (params, losses))
     return jax.tree.reduce(jnp.logical_and, checks)
 
 
 def is_loss(name: str) -> bool:
-    """Whether the metric of this name has to be finite at every update."""
+    """Return whether the metric of this name must be finite at every update."""
     return name.startswith("learner/") and "loss" in name
 
 
 def _evaluate_if(is_due: Bool[Array, ""], experiment: Experiment, state: TrainState) -> Metrics:
-    """Evaluates, or gives NaN. A loop of at most one pass, because `vmap` would turn a `cond` into doing both."""
+    """Evaluate, or return NaN. This is a loop of at most one pass, because `vmap` executes both branches of a `cond`."""
     shapes = jax.eval_shape(evaluate, experiment, state)
     skipped = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
 

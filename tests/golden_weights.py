@@ -1,4 +1,4 @@
-"""Weights of the recorded networks (see tests/golden/README.md) as parameters of our modules."""
+"""Conversion of the recorded networks (see tests/golden/README.md) to networks and parameters of this package."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ PRIOR = {"one_per_dim": "feature", True: "scalar", False: None}
 
 
 def cases(name):
-    """The recorded cases of a file: the meta data, and a function that gives an array by name."""
+    """Yield the recorded cases of a file: the meta data, and the arrays by name."""
     archive = np.load(GOLDEN / name)
     for meta in json.loads(str(archive["meta_json"]))["cases"]:
         prefix = f"c{meta['case']:03d}_"
@@ -48,7 +48,7 @@ def network(meta):
 
 
 def observation(meta, flat):
-    """The flat observation, cut up; the originals ignored the valid flag, so every row is present."""
+    """Split the flat observation; the original networks ignored the valid flag, so every row is present."""
     layout = meta["layout"]
     own, groups, start = None, {}, 0
     for part in layout["order"]:
@@ -67,7 +67,7 @@ def observation(meta, flat):
 
 
 def params(meta, weights):
-    """Parameters of `network(meta)`; recorded matrices are (out, in), Bayesian parts are interleaved."""
+    """Return the parameters of `network(meta)`; recorded matrices are (out, in), with interleaved Bayesian parts."""
 
     def dense(name):
         return {"kernel": jnp.asarray(weights[f"{name}.weight"].T), "bias": jnp.asarray(weights[f"{name}.bias"])}
@@ -86,14 +86,14 @@ def params(meta, weights):
         priors = {"prior_mean": "mean_z_0", "prior_variance": "sigma_z_0_sq"}
         mha = {"in_kernel": "attention.mha.in_proj_weight", "in_bias": "attention.mha.in_proj_bias"}
         mha |= {"out_kernel": "attention.mha.out_proj.weight", "out_bias": "attention.mha.out_proj.bias"}
-        names = {ours: f"{prefix}.{theirs}" for ours, theirs in (priors | mha).items()}
-        found = {ours: jnp.asarray(weights[theirs]) for ours, theirs in names.items() if theirs in weights}
-        return {ours: x.T if ours in mha else x.reshape(-1) for ours, x in found.items()}
+        recorded_names = {name: f"{prefix}.{recorded}" for name, recorded in (priors | mha).items()}
+        found = {name: jnp.asarray(weights[key]) for name, key in recorded_names.items() if key in weights}
+        return {name: x.T if name in mha else x.reshape(-1) for name, x in found.items()}
 
     names = [group["name"] for group in meta["layout"]["sets"]]
 
-    def in_our_order(kernel):
-        """Rows of [own, aggregates in the recorded order] as [own, aggregates in order of name]."""
+    def in_alphabetical_order(kernel):
+        """Reorder rows from [own, aggregates in the recorded order] to [own, aggregates in alphabetical order]."""
         if meta["agg_into_space"] == "same":
             return kernel
         own, *aggregates = jnp.split(kernel, meta["layout"]["n_local"] + width * np.arange(len(names)))
@@ -102,7 +102,7 @@ def params(meta, weights):
     def tower(kind):
         prefix = f"mlp_extractor.{'shared' if meta['shared_vf_pi'] else kind}_network"
         result = {f"Dense_{i}": dense(f"{prefix}.later_layer.{2 * i}") for i in range(len(meta["out_hidden"]) + 1)}
-        result["Dense_0"]["kernel"] = in_our_order(result["Dense_0"]["kernel"])
+        result["Dense_0"]["kernel"] = in_alphabetical_order(result["Dense_0"]["kernel"])
         for name in names:
             result[f"{name}_encoder"] = encoder(f"{prefix}.embedders.{name}.embedding.nn")
             result[f"{name}_aggregator"] = pooling(f"{prefix}.aggregators.{name}")

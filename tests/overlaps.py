@@ -1,4 +1,4 @@
-"""Oracle: by how much discs, squares and walls overlap, in float64, for arrays with any leading axes."""
+"""Oracle of the overlaps of discs, squares and walls, in float64, for arrays with any leading axes."""
 
 import itertools
 
@@ -8,7 +8,7 @@ RADIUS, HALF = 0.0165, 0.05
 
 
 def overlaps(state, side):
-    """The deepest overlap of each kind of pair, in meters, over all states."""
+    """Return the deepest overlap of each kind of pair, in meters, over all states."""
     disc, box = np.float64(state.position), np.float64(state.box_position)
     angle = np.float64(state.box_heading)
     discs, boxes = range(disc.shape[-2]), range(box.shape[-2])
@@ -34,7 +34,7 @@ def _disc_in_box(displacement, axes, box):
 
 
 def _box_in_box(position, angle, i, j):
-    """Separating axes: those of both squares; along each, a square reaches half a side times |cos| + |sin|."""
+    """Test the separating axes of both squares; along each, a square reaches half a side times |cos| + |sin|."""
     displacement = position[..., j, :] - position[..., i, :]
     gaps = []
     for one, other, turn in itertools.product((i,), (j,), (0, np.pi / 2)):

@@ -1,7 +1,7 @@
-"""Five tiny tasks whose values and best actions are known; each needs one more part of a learner to work.
+"""Five tiny tasks with known values and best actions; each of them needs one more part of a learner.
 
-They are one task with different numbers, so that one compiled program trains all of them side by side. So are the
-projections of TRL here.
+They are one task with different numbers, so that one compiled program trains all of them vectorized. For the same
+reason, TRL selects its projection by a number here.
 """
 
 from functools import cache
@@ -20,13 +20,13 @@ from jaxswarm.types import Entities, Observation, Step, pytree, static
 
 @pytree
 class State:
-    cue: jax.Array  # [agents], -1 or 1, the same for all
+    cue: jax.Array  # [agents], -1 or 1, equal for all agents
     time: jax.Array
 
 
 @pytree
 class Probe:
-    """Two agents that see a common cue; the reward comes at the end of the episode.
+    """Task of two agents that observe a common cue; the reward comes at the end of the episode.
 
     reward = constant + cue_reward cue - action_weight mean((action - target - cue_target cue)^2)
     """
@@ -38,7 +38,7 @@ class Probe:
     cue_target: float = 0.0
     length: int = 1
     num_agents: int = static(default=2)
-    episode_length: int = static(default=2)  # the longest
+    episode_length: int = static(default=2)  # the maximum of `length`
     action_dim: ClassVar[int] = 1
 
     def reset(self, key):
@@ -85,8 +85,8 @@ CASES = [
 
 
 @pytree
-class AnyTRL(TRL):
-    """TRL whose kind of projection is a number."""
+class IndexedTRL(TRL):
+    """TRL whose projection is selected by a number."""
 
     index: int = 0
 
@@ -101,8 +101,8 @@ class AnyTRL(TRL):
 
 @cache
 def _train_all(name):
-    """Of all probes, and for TRL of all projections: parameters before the first and after each update, and returns."""
-    learner = AnyTRL(**OPTIONS) if name == "trl" else LEARNERS[name](**OPTIONS)
+    """Train all probes, TRL with all projections; returns the results of `train_probes`, [projections, probes, ...]."""
+    learner = IndexedTRL(**OPTIONS) if name == "trl" else LEARNERS[name](**OPTIONS)
 
     def train(index, task):
         chosen = learner.replace(index=index) if name == "trl" else learner
@@ -122,14 +122,14 @@ def _train_all(name):
 
 
 def train_probes(name, projection):
-    """By probe: parameters before the first and after each update, and the returns before each."""
+    """Return, per probe, the parameters before the first and after each update, and the returns before each."""
     index = list(PROJECTIONS).index(projection) if projection else 0
     results = _train_all(name)
     return {probe: jax.tree.map(lambda x, i=i: x[index, i], results) for i, probe in enumerate(PROBES)}
 
 
-def look(params, cue, time):
-    """Policy and value of the first agent."""
+def policy_and_value(params, cue, time):
+    """Return policy and value of the first agent."""
     obs = next(iter(PROBES.values())).observe(State(jnp.full((2,), cue, jnp.float32), jnp.int32(time)))
     policy, value = NETWORK.apply(params, obs)
     return policy[0], value[0]

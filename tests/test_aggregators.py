@@ -1,4 +1,4 @@
-"""What every aggregator promises, over groups of any size; and what each one computes, against formulas in NumPy."""
+"""Contracts of all aggregators for groups of any size, and the vector of each aggregator against a NumPy formula."""
 
 import functools
 import itertools
@@ -27,7 +27,7 @@ MODELS = {name: aggregator(**SMALL.get(name, {})) for name, aggregator in AGGREG
     "attentive, query": AGGREGATORS["attentive"](pooling="query"),
     "attentive, query, no residual": AGGREGATORS["attentive"](pooling="query", residual=False, num_heads=4),
 }
-LENGTH = {name: model.num_parts * WIDTH for name, model in MODELS.items()}  # of a message
+MESSAGE_LENGTH = {name: model.num_parts * WIDTH for name, model in MODELS.items()}
 OWN_FEATURES = np.random.default_rng(5).normal(size=(RECEIVERS, OWN)).astype(np.float32)
 
 
@@ -37,15 +37,15 @@ def segments(mask):
 
 @functools.cache
 def params_of(name):
-    """Of no special values, as after some training."""
+    """Return random parameters, as after some training."""
     rng = np.random.default_rng(3)
-    messages, full = jnp.zeros((RECEIVERS * SLOTS, LENGTH[name])), segments(np.ones((RECEIVERS, SLOTS), bool))
+    messages, full = jnp.zeros((RECEIVERS * SLOTS, MESSAGE_LENGTH[name])), segments(np.ones((RECEIVERS, SLOTS), bool))
     params = jax.jit(MODELS[name].init)(jax.random.key(0), messages, full)
     return jax.tree.map(lambda x: x + jnp.asarray(0.5 * rng.normal(size=x.shape), jnp.float32), params)
 
 
-def output_and_gradients(model):
-    """Of the sum of squares, with respect to the parameters and to the messages."""
+def gradients_and_output(model):
+    """Return the gradients of the sum of squares with respect to parameters and messages, and the output."""
 
     def loss(params, messages, segments):
         output = model.apply(params, messages, segments)
@@ -54,15 +54,15 @@ def output_and_gradients(model):
     return jax.jit(jax.grad(loss, (0, 1), has_aux=True))
 
 
-EVALUATE = {name: output_and_gradients(model) for name, model in MODELS.items()}  # to gradients, output
+GRADIENTS_AND_OUTPUT = {name: gradients_and_output(model) for name, model in MODELS.items()}
 seeds = st.integers(0, 2**31 - 1)
 every_aggregator = pytest.mark.parametrize("name", MODELS)
 
 
 def random_messages(name, seed):
-    """Messages of groups of any size, from none to all slots, some of them standing there several times."""
+    """Return messages of groups of 0 to all slots; some messages occur several times."""
     rng = np.random.default_rng(seed)
-    messages = rng.normal(size=(RECEIVERS, SLOTS, LENGTH[name]))
+    messages = rng.normal(size=(RECEIVERS, SLOTS, MESSAGE_LENGTH[name]))
     messages = messages[:, rng.integers(0, rng.integers(1, SLOTS + 1), SLOTS)]
     mask = rng.random((RECEIVERS, SLOTS)) < rng.choice([0.0, 0.3, 0.7, 1.0], (RECEIVERS, 1))
     return messages.astype(np.float32), mask, rng
@@ -72,7 +72,7 @@ def flat(messages):
     return jnp.asarray(messages.reshape(-1, messages.shape[-1]), jnp.float32)
 
 
-# ---- formulas: [entities, length] to a vector
+# ---- Formulas from messages [entities, length] to a vector.
 
 
 def softmax(x, axis=-1):
@@ -85,7 +85,7 @@ def softplus(x):
 
 
 def conditioned_one_by_one(x, model, params):
-    """Posterior of a Gaussian prior after one observation at a time."""
+    """Return the posterior of a Gaussian prior after one observation at a time."""
     rectify = softplus if model.rectifier == "softplus" else np.exp
     raw = params.get("prior_variance", np.ones(1))
     variance = np.full(WIDTH, np.inf) if model.prior_variance is None else np.broadcast_to(rectify(raw), WIDTH)
@@ -112,7 +112,7 @@ def attended(x, model, params, own):
 
 
 def nearest(x, model):
-    """Python sorts tuples by their first entries, then by the next."""
+    """Return the nearest rows; Python compares tuples by their first entries, then by the next."""
     rows = sorted(tuple(row) for row in x)[: model.max_entities]
     return np.array(rows + [(0.0,) * WIDTH] * (model.max_entities - len(rows))).reshape(-1)
 
@@ -156,7 +156,7 @@ def test_groups_of_any_size_give_what_the_formula_says(name, seed):
     messages, mask, _ = random_messages(name, seed)
     if name == "rbf":
         messages[..., 1:3] /= np.linalg.norm(messages[..., 1:3], axis=-1, keepdims=True)
-    _, result = EVALUATE[name](params_of(name), flat(messages), segments(mask))
+    _, result = GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages), segments(mask))
     assert result.dtype == jnp.float32
     params = jax.tree.map(np.float64, params_of(name).get("params", {}))
     formula = FORMULAS[name.partition(",")[0]]
@@ -171,8 +171,8 @@ def test_absent_entities_have_no_influence(name, seed, scale):
     messages, mask, rng = random_messages(name, seed)
     noise = np.clip(rng.normal(size=messages.shape), -3, 3).astype(np.float32) * np.float32(scale)
     other = np.where(mask[..., None], messages, noise)
-    one = EVALUATE[name](params_of(name), flat(messages), segments(mask))
-    two = EVALUATE[name](params_of(name), flat(other), segments(mask))
+    one = GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages), segments(mask))
+    two = GRADIENTS_AND_OUTPUT[name](params_of(name), flat(other), segments(mask))
     jax.tree.map(np.testing.assert_array_equal, one, two)
     (_, gradient), _ = one
     np.testing.assert_array_equal(gradient[~mask.reshape(-1)], 0.0)
@@ -183,25 +183,25 @@ def test_absent_entities_have_no_influence(name, seed, scale):
 @given(seed=seeds)
 def test_order_has_no_influence(name, seed):
     _, mask, rng = random_messages(name, seed)
-    messages = rng.normal(size=(RECEIVERS, SLOTS, LENGTH[name]))
-    order = rng.permutation(RECEIVERS * SLOTS)  # also across receivers
+    messages = rng.normal(size=(RECEIVERS, SLOTS, MESSAGE_LENGTH[name]))
+    order = rng.permutation(RECEIVERS * SLOTS)
     regular = segments(mask)
     shuffled = regular.replace(receiver=regular.receiver[order], is_present=regular.is_present[order])
-    (_, one_gradient), one = EVALUATE[name](params_of(name), flat(messages), regular)
-    (_, two_gradient), two = EVALUATE[name](params_of(name), flat(messages)[order], shuffled)
+    (_, one_gradient), one = GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages), regular)
+    (_, two_gradient), two = GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages)[order], shuffled)
     np.testing.assert_allclose(two, one, atol=2e-6, rtol=1e-5)
-    rounding = 4e-6 * np.abs(one_gradient).max()  # of large parts of a gradient that cancel
+    rounding = 4e-6 * np.abs(one_gradient).max()  # large terms of a gradient can cancel
     np.testing.assert_allclose(two_gradient, one_gradient[order], atol=2e-5 + rounding, rtol=1e-4)
 
 
 @every_aggregator
-@pytest.mark.parametrize("nobody", [-(2**31), -1, RECEIVERS, 2**31 - 1])
-def test_messages_to_receivers_that_do_not_exist_are_absent(name, nobody):
+@pytest.mark.parametrize("missing_receiver", [-(2**31), -1, RECEIVERS, 2**31 - 1])
+def test_messages_to_receivers_that_do_not_exist_are_absent(name, missing_receiver):
     messages, mask, _ = random_messages(name, 2)
     regular = segments(mask)
-    receiver = jnp.where(regular.is_present, regular.receiver, nobody)
+    receiver = jnp.where(regular.is_present, regular.receiver, missing_receiver)
     other = regular.replace(receiver=receiver, is_present=jnp.ones_like(regular.is_present))
-    one, two = (EVALUATE[name](params_of(name), flat(messages), x) for x in (regular, other))
+    one, two = (GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages), x) for x in (regular, other))
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
@@ -209,10 +209,10 @@ def test_messages_to_receivers_that_do_not_exist_are_absent(name, nobody):
 def test_gradients_are_those_of_the_output(name):
     _, mask, rng = random_messages(name, 11)
     mask[0], mask[1, 0] = True, True
-    messages, direction = rng.normal(size=(2, RECEIVERS * SLOTS, LENGTH[name]))
-    (_, gradient), _ = EVALUATE[name](params_of(name), flat(messages), segments(mask))
+    messages, direction = rng.normal(size=(2, RECEIVERS * SLOTS, MESSAGE_LENGTH[name]))
+    (_, gradient), _ = GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages), segments(mask))
     outputs = [
-        np.float64(EVALUATE[name](params_of(name), flat(messages + step * direction), segments(mask))[1])
+        np.float64(GRADIENTS_AND_OUTPUT[name](params_of(name), flat(messages + step * direction), segments(mask))[1])
         for step in (-1e-3, 1e-3)
     ]
     numeric = (np.square(outputs[1]).sum() - np.square(outputs[0]).sum()) / 2e-3
@@ -222,16 +222,16 @@ def test_gradients_are_those_of_the_output(name):
 @every_aggregator
 @pytest.mark.parametrize("num_slots", [0, SLOTS])
 def test_empty_groups_give_finite_output_and_gradient(name, num_slots):
-    messages = jnp.ones((RECEIVERS * num_slots, LENGTH[name]))
+    messages = jnp.ones((RECEIVERS * num_slots, MESSAGE_LENGTH[name]))
     empty = segments(np.zeros((RECEIVERS, num_slots), bool))
-    for leaf in jax.tree.leaves(EVALUATE[name](params_of(name), messages, empty)):
+    for leaf in jax.tree.leaves(GRADIENTS_AND_OUTPUT[name](params_of(name), messages, empty)):
         assert np.isfinite(leaf).all()
 
 
 @every_aggregator
 def test_no_receivers_give_no_vectors(name):
     none = segments_of(jnp.zeros((0, SLOTS), bool)).replace(own=jnp.zeros((0, OWN)))
-    assert MODELS[name].apply(params_of(name), jnp.zeros((0, LENGTH[name])), none).shape[0] == 0
+    assert MODELS[name].apply(params_of(name), jnp.zeros((0, MESSAGE_LENGTH[name])), none).shape[0] == 0
 
 
 def test_softmax_of_large_messages_is_finite_and_exact():
@@ -252,7 +252,7 @@ def test_query_pooling_needs_what_receivers_know():
 def test_a_histogram_counts_entities_on_the_border_once():
     angle = np.linspace(-np.pi, np.pi, 81)
     features = np.stack([np.tile([0.0, 0.5, 1.0], 27), np.cos(angle), np.sin(angle)], -1)
-    features = np.concatenate([features, np.zeros((3, 3))])  # at no distance, without a bearing
+    features = np.concatenate([features, np.zeros((3, 3))])  # at distance 0, without a bearing
     model = AGGREGATORS["histogram"](num_distances=4, num_bearings=8)
     result = model.apply({}, jnp.asarray(features, jnp.float32), Segments(jnp.arange(84), jnp.ones(84, bool), 84))
     np.testing.assert_array_equal(result.sum(-1), 1.0)
@@ -319,9 +319,9 @@ def test_no_variance_is_too_extreme(rectifier, raw):
 MASK = np.array([[True, False, True, True, False], [False] * SLOTS, [False, False, False, True, False]])
 
 
-def shares(name):
-    """What a model gives for random messages, and these messages; distances are positive."""
-    messages = np.random.default_rng(8).normal(size=(RECEIVERS, SLOTS, LENGTH[name])).astype(np.float32)
+def weights_and_messages(name):
+    """Return the weights of a model for random messages with positive distances, and these messages."""
+    messages = np.random.default_rng(8).normal(size=(RECEIVERS, SLOTS, MESSAGE_LENGTH[name])).astype(np.float32)
     messages[..., 0] = np.abs(messages[..., 0])
     view = DenseView(jnp.asarray(messages), jnp.asarray(MASK), jnp.asarray(OWN_FEATURES))
     weights = jax.jit(lambda params, view: MODELS[name].apply(params, view, method="weights"))(params_of(name), view)
@@ -330,7 +330,7 @@ def shares(name):
 
 @every_aggregator
 def test_shares_sum_to_one_over_present_entities(name):
-    weights, _ = shares(name)
+    weights, _ = weights_and_messages(name)
     assert (weights[~MASK] == 0).all()
     assert (weights >= 0).all()
     np.testing.assert_allclose(weights.sum(1), [1, 0, 1], rtol=1e-5)
@@ -341,7 +341,7 @@ def _softmax(x):
 
 
 def _attention(x, name="attentive"):
-    """Mean over heads and queries, with queries, keys and values one after the other in the kernel."""
+    """Return the attention, mean over heads and queries; the kernel concatenates queries, keys and values."""
     kernel, bias = (np.asarray(params_of(name)["params"][part]) for part in ("in_kernel", "in_bias"))
     q, k, _ = (part.reshape(len(x), 2, -1) for part in np.split(x @ kernel + bias, 3, -1))
     score = np.einsum("ihd,jhd->jhi", q, k) / np.sqrt(q.shape[-1])
@@ -362,14 +362,14 @@ SHARES = {
 
 @pytest.mark.parametrize("name", SHARES)
 def test_shares_are_those_of_the_formula(name):
-    weights, messages = shares(name)
+    weights, messages = weights_and_messages(name)
     for receiver in (0, 2):
         present = MASK[receiver]
         np.testing.assert_allclose(weights[receiver, present], SHARES[name](messages[receiver, present]), rtol=1e-4)
 
 
 def test_entities_that_concat_has_no_room_for_have_no_share():
-    weights, messages = shares("concat")
+    weights, messages = weights_and_messages("concat")
     np.testing.assert_allclose(weights[0, MASK[0]], 1 / 3, rtol=1e-6)
     view = DenseView(jnp.asarray(messages), jnp.asarray(MASK))
     (nearest,) = np.flatnonzero(AGGREGATORS["concat"](max_entities=1).weights(view)[0])

@@ -1,4 +1,4 @@
-"""Recorded states of the thesis's program, its own averages, closed forms, and symmetries.
+"""Tests of the box tasks against recorded states and averages of the thesis's program, closed forms and symmetries.
 
 `golden/boxes.npz` holds numbered cases: for case k `cKKK_actions, kb_pose, box_pose, box_vel, reward` at every step,
 and `cKKK_obs` at every `obs_every`-th; index 0 is the start. `meta_json` describes the cases.
@@ -59,7 +59,7 @@ def step(task, state, action):
 
 
 def place(task, boxes, robots=None):
-    """A state with boxes at these places, all present, and robots out of their way."""
+    """Return a state with all boxes present at these positions, and robots away from them."""
     num_boxes = len(boxes)
     robots = np.stack([np.linspace(-0.45, 0.45, task.num_agents), np.full(task.num_agents, -0.47)], -1)
     arrays = (robots, np.zeros(task.num_agents), boxes, np.zeros(num_boxes), np.zeros((num_boxes, 3)))
@@ -67,11 +67,13 @@ def place(task, boxes, robots=None):
 
 
 @jax.jit
-def reward_between(task, before, after):
-    """The reward of a step that moves boxes there, with physics that does just that."""
+def reward_between(task, state, next_box_position):
+    """Return the reward of a step in which a physics stub moves the boxes to `next_box_position`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rigid2d, "move", lambda solver, side, state, command: state.replace(box_position=after))
-        return task.step(KEY, before, jnp.zeros((task.num_agents, 2)))[1].reward
+        patch.setattr(
+            rigid2d, "move", lambda solver, side, state, command: state.replace(box_position=next_box_position)
+        )
+        return task.step(KEY, state, jnp.zeros((task.num_agents, 2)))[1].reward
 
 
 @golden_cases
@@ -81,7 +83,7 @@ def test_recorded_observations_are_reproduced(case):
     num_agents, recorded = case["n_agents"], record(case, "obs")
     rows, boxes, own = np.split(recorded, [5 * (num_agents - 1), recorded.shape[-1] - 5], axis=-1)
 
-    # Recorded neighbors stand in the order of their index; ours in cyclic order from the robot on.
+    # Recorded neighbors are in the order of their index; ours are in cyclic order after the robot.
     index = (np.arange(num_agents)[:, None] + np.arange(1, num_agents)) % num_agents
     neighbors = np.take_along_axis(np.asarray(obs.groups["neighbors"].features), np.argsort(index)[None, ..., None], 2)
     np.testing.assert_allclose(neighbors, rows.reshape(*rows.shape[:2], -1, 5), atol=2e-5)
@@ -97,8 +99,8 @@ def test_recorded_observations_are_reproduced(case):
 @golden_cases
 def test_recorded_rewards_are_reproduced_from_recorded_states(case):
     task, states = recorded_task(case), recorded_states(case)
-    before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], states) for part in (slice(-1), slice(1, None)))
-    rewards = jax.vmap(reward_between, (None, 0, 0))(task, before, after.box_position)
+    state = jax.tree.map(lambda leaf: leaf[:-1], states)
+    rewards = jax.vmap(reward_between, (None, 0, 0))(task, state, states.box_position[1:])
     np.testing.assert_allclose(rewards, record(case, "reward"), atol=2e-5)
 
 
@@ -118,12 +120,12 @@ def test_actions_say_half_speed_at_zero_and_are_clipped():
     state = place(task, [[0.3, 0.3], [0.3, 0.0], [-0.3, 0.3], [-0.3, 0.0]])
     state = state.replace(heading=jnp.full(3, jnp.pi / 2))
     actions = jnp.array([[0.0, 0.0], [9.0, -9.0], [-9.0, 0.5]])
-    after, _ = step(task, state, actions)
+    next_state, _ = step(task, state, actions)
     clipped, _ = step(task, state, jnp.clip(actions, -1, 1))
-    np.testing.assert_array_equal(after.position, clipped.position)
-    distance = jnp.linalg.norm(after.position - state.position, axis=-1)
+    np.testing.assert_array_equal(next_state.position, clipped.position)
+    distance = jnp.linalg.norm(next_state.position - state.position, axis=-1)
     np.testing.assert_allclose(distance[jnp.array([0, 2])], [0.0046, 0.0], atol=1e-6)
-    turned = after.heading - state.heading
+    turned = next_state.heading - state.heading
     np.testing.assert_allclose(turned, [0, -0.92 * np.pi / 2, 0.46 * np.pi / 2], atol=1e-5)
 
 
@@ -142,7 +144,7 @@ def test_a_robot_sees_as_the_formulas_say():
 
 
 def random_state(task):
-    """Without physics: bodies anywhere."""
+    """Draw a state with random bodies that may overlap."""
     keys = jax.random.split(KEY, 3)
     state = place(task, jax.random.uniform(keys[0], (task.num_boxes, 2), minval=-0.4, maxval=0.4))
     return state.replace(
@@ -187,26 +189,26 @@ def test_rewards_of_an_assembly_add_up_to_what_distances_shrink():
     def distances(state):
         return [np.linalg.norm(np.float64(a) - np.float64(b)) for a, b in itertools.combinations(state.box_position, 2)]
 
-    assert abs(total) > 1e-3  # robots push
+    assert abs(total) > 1e-3  # the robots move boxes
     np.testing.assert_allclose(total, sum(distances(start)) - sum(distances(state)), atol=1e-6)
     np.testing.assert_allclose(outcome.metrics["box_distance"], np.mean(distances(state)), rtol=1e-6)
 
 
-def test_amplified_rewards_pay_for_close_colours_that_are_apart():
+def test_amplified_rewards_pay_for_close_colors_that_are_apart():
     task = Clustering(num_agents=2)
-    before = place(task, [[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [0.2, 0.3]])
-    after = jnp.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.3], [0.2, 0.3]])  # centroids (0.1, 0) -> (0.05, 0), (0.1, 0.3)
+    state = place(task, [[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [0.2, 0.3]])
+    moved = jnp.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.3], [0.2, 0.3]])  # centroids (0.1, 0) -> (0.05, 0), (0.1, 0.3)
     expected = 20 * (1.5 * (0.1 + 0.0) / 2 + np.hypot(0.05, 0.3) - 0.3)
-    np.testing.assert_allclose(reward_between(task, before, after), expected, rtol=1e-5)
+    np.testing.assert_allclose(reward_between(task, state, moved), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("box", "corner"), [(0, (-0.5, -0.5)), (1, (0.5, 0.5)), (2, (0.5, -0.5)), (3, (-0.5, 0.5))])
-def test_each_colour_has_its_corner(box, corner):
+def test_each_color_has_its_corner(box, corner):
     task = Clustering(num_agents=2, num_clusters=4, reward="corners", side=1.0)
-    before = place(task, [[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [0.2, 0.3]])
-    after = before.box_position.at[box].set(jnp.array(corner))
-    expected = 20 * np.linalg.norm(np.array(corner) - np.float64(before.box_position[box]))
-    np.testing.assert_allclose(reward_between(task, before, after), expected, rtol=1e-5)
+    state = place(task, [[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [0.2, 0.3]])
+    moved = state.box_position.at[box].set(jnp.array(corner))
+    expected = 20 * np.linalg.norm(np.array(corner) - np.float64(state.box_position[box]))
+    np.testing.assert_allclose(reward_between(task, state, moved), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("reward", ["amplified", "corners"])
@@ -236,7 +238,7 @@ def test_one_hot_identity_says_what_groups_say():
 
 @pytest.mark.slow
 def test_the_number_of_boxes_varies_evenly_over_clusters(monkeypatch):
-    monkeypatch.setattr(rigid2d, "settle", lambda solver, side, state, substeps: state)  # this is not about physics
+    monkeypatch.setattr(rigid2d, "settle", lambda solver, side, state, substeps: state)  # physics has no influence here
     task = Clustering(num_agents=2, num_boxes=6, num_clusters=3, active_boxes=(2, 6))
     present = np.asarray(jax.jit(jax.vmap(task.reset))(jax.random.split(KEY, 400)).box_present)
     share = np.bincount(present.sum(1), minlength=7) / 400
@@ -245,8 +247,8 @@ def test_the_number_of_boxes_varies_evenly_over_clusters(monkeypatch):
     assert (of_cluster.max(1) - of_cluster.min(1) <= 1).all()
 
 
-def with_one_absent(task):
-    """Two worlds, with the absent box elsewhere."""
+def states_with_one_absent(task):
+    """Return two states that differ only in the position of the absent box."""
     state = place(task, [[-0.1, -0.4], [0.2, -0.3], [0.0, 0.3], [0.2, 0.3]])
     state = state.replace(
         position=jnp.array([[-0.17, -0.4], [0.3, -0.47], [0.4, -0.47]]),
@@ -257,7 +259,7 @@ def with_one_absent(task):
 
 def test_absent_boxes_are_not_touched():
     task = Assembly(num_agents=3)
-    state, moved = with_one_absent(task)
+    state, moved = states_with_one_absent(task)
     (end, outcome), (moved_end, moved_outcome) = (step(task, s, jnp.ones((3, 2))) for s in (state, moved))
     np.testing.assert_array_equal(end.position, moved_end.position)
     np.testing.assert_array_equal(end.box_position[:3], moved_end.box_position[:3])
@@ -270,9 +272,9 @@ def test_absent_boxes_are_not_touched():
     ids=["assembly", "amplified", "corners"],
 )
 def test_absent_boxes_are_neither_seen_nor_rewarded(task):
-    state, moved = with_one_absent(task)
-    after = state.box_position + jnp.array([[0.1, 0.0], [0.0, 0.2], [0.1, 0.1], [0.0, 0.0]])
-    reward, moved_reward = (reward_between(task, s, after.at[3].set(s.box_position[3] + 0.1)) for s in (state, moved))
+    state, moved = states_with_one_absent(task)
+    target = state.box_position + jnp.array([[0.1, 0.0], [0.0, 0.2], [0.1, 0.1], [0.0, 0.0]])
+    reward, moved_reward = (reward_between(task, s, target.at[3].set(s.box_position[3] + 0.1)) for s in (state, moved))
     assert reward != 0
     np.testing.assert_array_equal(reward, moved_reward)
     obs, moved_obs = observe(task, state), observe(task, moved)
@@ -295,12 +297,12 @@ def test_starts_are_uniform_with_boxes_in_the_middle():
         assert np.abs(np.exp(1j * np.float64(heading)).mean()) < 0.03
     assert np.abs(states.position).max() < 0.5 - 0.0165
     assert np.abs(states.position).mean() == pytest.approx(0.25, abs=0.005)
-    assert np.abs(states.box_position).mean() == pytest.approx(0.35 / 2, abs=0.008)  # overlaps were pushed apart
+    assert np.abs(states.box_position).mean() == pytest.approx(0.35 / 2, abs=0.008)  # overlapping boxes were separated
     assert np.quantile(np.abs(states.box_position), 0.99) == pytest.approx(0.35, abs=0.02)
     assert not states.box_velocity.any()
-    side = 0.7 * (2 + np.sqrt(2) + 5 * np.arcsinh(1)) / 15  # mean distance of two points of the square
+    mean_distance = 0.7 * (2 + np.sqrt(2) + 5 * np.arcsinh(1)) / 15  # of two uniform points in the middle square
     distance = np.linalg.norm(states.box_position[:, :, None] - states.box_position[:, None], axis=-1)
-    assert distance.sum((1, 2)).mean() / 2 == pytest.approx(6 * side, abs=0.06)
+    assert distance.sum((1, 2)).mean() / 2 == pytest.approx(6 * mean_distance, abs=0.06)
 
 
 @pytest.mark.slow
@@ -310,7 +312,7 @@ def test_starts_are_uniform_with_boxes_in_the_middle():
     ids=["assembly", "clustering"],
 )
 def test_robots_that_drive_straight_on_score_as_untrained_networks_did(task, expected, deviation):
-    """Means of 118 and 94 runs; deviations are three standard errors of 256 episodes, rounded up."""
+    """Expected values are means of 118 and 94 runs; deviations are three rounded standard errors of 256 episodes."""
 
     @jax.jit
     @jax.vmap

@@ -1,4 +1,4 @@
-"""Every task with the interface of gymnax, against the task itself."""
+"""The gymnax adapter of every task agrees with the task itself."""
 
 import jax
 import jax.numpy as jnp

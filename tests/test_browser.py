@@ -1,4 +1,4 @@
-"""The page of a replay in a real browser, from disk and without a network."""
+"""Tests of replay pages in a real browser, loaded from disk without a network."""
 
 import html
 import itertools
@@ -35,8 +35,8 @@ def browser():
 
 @pytest.fixture
 def show(browser, tmp_path):
-    """A function that opens a page from disk, offline; what the page complains of fails the test."""
-    complaints, contexts = [], []
+    """Return a function that opens a page from disk, offline; errors, warnings and requests fail the test."""
+    problems, contexts = [], []
 
     def show(text, size="desktop", **options):
         path = tmp_path / "replay.html"
@@ -45,16 +45,16 @@ def show(browser, tmp_path):
         context = browser.new_context(viewport={"width": width, "height": height}, offline=True, **options)
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda message: complaints.append(message.text) if message.type != "log" else None)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: complaints.append(request.url) if request.url.startswith("http") else None)
+        page.on("console", lambda message: problems.append(message.text) if message.type != "log" else None)
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("request", lambda request: problems.append(request.url) if request.url.startswith("http") else None)
         page.goto(path.as_uri())
         return page
 
     yield show
     for context in contexts:
         context.close()
-    assert not complaints
+    assert not problems
 
 
 def ready(page):
@@ -63,7 +63,7 @@ def ready(page):
 
 
 def colors(page, canvas="figure canvas"):
-    """Number of different colors that were drawn."""
+    """Return the number of different colors on a canvas."""
     script = """canvas => {
       const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", {willReadFrequently: true});
       copy.drawImage(canvas, 0, 0);
@@ -77,14 +77,14 @@ def shown_step(page):
 
 
 def click_agent(page, agent, figure=0):
-    """Where the page draws it."""
+    """Click the place where the page draws an agent."""
     script = """([agent, figure]) => {
       const film = page.films[figure], box = film.canvas.getBoundingClientRect();
-      const [x, y] = lens(film, box.width).to(place(film, film.kinds[0], agent, page.step));
+      const [x, y] = makeView(film, box.width).to(place(film, film.kinds[0], agent, page.step));
       return {x, y};
     }"""
-    spot = page.evaluate(script, [agent, figure])
-    page.locator("figure canvas").nth(figure).click(position=spot)
+    position = page.evaluate(script, [agent, figure])
+    page.locator("figure canvas").nth(figure).click(position=position)
 
 
 @pytest.mark.parametrize(("name", "size"), list(itertools.product(FILMS, SIZES)))
@@ -103,7 +103,7 @@ def test_a_page_plays_to_the_end_and_again(show):
     page.wait_for_function("page.step > 5")
     page.wait_for_function("!page.playing")
     assert shown_step(page) == 39
-    assert page.locator("#play").inner_text() == "Again"
+    assert page.locator("#play").inner_text() == "Replay"
     page.select_option("#speed", "0.25")
     page.keyboard.press("Escape")
     page.click("#play")
@@ -116,10 +116,10 @@ def test_a_page_plays_to_the_end_and_again(show):
 
 def test_a_large_swarm_plays_at_30_frames_a_second(show):
     page = ready(show(pages.html([episode(**FILMS["a large swarm"])])))
-    before = page.evaluate("page.drawn")
+    num_drawn = page.evaluate("page.drawn")
     page.click("#play")
     page.wait_for_timeout(2000)
-    assert page.evaluate("page.drawn") - before >= 60
+    assert page.evaluate("page.drawn") - num_drawn >= 60
 
 
 def test_a_page_scrubs_and_steps(show):
@@ -146,25 +146,25 @@ def test_a_selected_agent_tells_what_it_looks_at(show, size):
     film = episode(num_evaders=2)
     page = ready(show(pages.html([film]), size))
     page.locator("#scrub").fill("12")
-    before = colors(page)
+    num_colors = colors(page)
     click_agent(page, 4)
     selected = page.evaluate("page.films[0].selected")
-    told = page.locator(".seen")
-    assert f"Agent {selected} sees" in told.inner_text()
+    weights = page.locator(".weights")
+    assert f"Agent {selected} perceives" in weights.inner_text()
     body = int(film.shares[12, selected, :6].argmax())
     percent = 100 * film.shares[12, selected, body]
-    first = told.locator("li").first.inner_text()
+    first = weights.locator("li").first.inner_text()
     assert first.startswith(f"agent {body} ")
     assert float(first.split()[2]) == pytest.approx(percent, rel=0.06)
-    assert colors(page) > before
+    assert colors(page) > num_colors
     page.keyboard.press("Escape")
-    assert "Select an agent" in told.inner_text()
+    assert "Select an agent" in weights.inner_text()
 
 
 def test_a_swarm_without_weights_says_so(show):
     page = ready(show(pages.html([episode(shares=False)])))
     click_agent(page, 0)
-    assert "too large" in page.locator(".seen").inner_text()
+    assert "too large" in page.locator(".weights").inner_text()
 
 
 def test_films_play_side_by_side_in_step(show):
@@ -173,13 +173,13 @@ def test_films_play_side_by_side_in_step(show):
     assert one["y"] == two["y"]
     assert one["x"] + one["width"] <= two["x"]
     page.locator("#scrub").fill("39")
-    assert colors(page) > 20  # the shorter one stands at its end
+    assert colors(page) > 20  # the shorter film shows its last frame
     click_agent(page, 2, 0)
     assert page.evaluate("page.films.map(film => film.selected === null)") == [False, True]
 
 
 def test_a_page_lives_in_a_notebook(show):
-    """In a frame whose origin is nobody's."""
+    """The frame of the notebook has an opaque origin."""
     source = html.escape(pages.html([episode(num_boxes=3)]), quote=True)
     page = show(f'<iframe sandbox="allow-scripts" style="width:600px;height:600px" srcdoc="{source}"></iframe>')
     frame = page.frame_locator("iframe")

@@ -64,7 +64,7 @@ def test_very_many_points_are_thinned_out_to_the_ends():
 
 @pytest.fixture
 def seeds():
-    """Nine seeds on one grid, of which three end early."""
+    """Return nine seeds on one grid; three of them end early."""
     key = np.random.default_rng(0)
     return [make_curve(range(n), key.normal(size=n)) for n in (4, 4, 6, 8, 8, 8, 8, 8, 8)]
 
@@ -88,7 +88,7 @@ def test_the_interquartile_mean_drops_a_quarter_on_either_side(seeds):
     assert (line.y < line.upper).all()
 
 
-def test_the_interval_is_that_of_redrawn_seeds():
+def test_the_interval_is_that_of_bootstrapped_seeds():
     values = np.random.default_rng(1).normal(size=(10, 2))
     _, lower, upper = curves.interquartile_mean(values)
     bootstrapped = values[np.random.default_rng(2).integers(10, size=(20_000, 10))]
@@ -126,7 +126,7 @@ def test_the_time_to_a_threshold_is_that_of_the_first_evaluation_there():
 
 
 def test_seeds_that_end_early_count_as_long_as_they_last():
-    """Product of what remains at each event: 1 of 5 at time 1; one ends at 2; 1 of 3 at time 3; two end at 4."""
+    """Compare with the product over events: 1 of 5 at time 1, one ends at 2, 1 of 3 at time 3, two end at 4."""
     ends = {1: True, 2: False, 3: True, 4: False}
     seeds = [make_curve([0, at], [0, 1 if is_event else 0]) for at, is_event in ends.items()]
     line = curves.reaching([*seeds, make_curve([0, 4], [0, 0])], 1.0)

@@ -24,7 +24,7 @@ SPACES = [Plane(SIDE), Torus(SIDE)]
 
 
 def simulate(name, is_torus, state, action):
-    """The sub-steps as the thesis's program makes them, in float64; also the last displacement over its duration."""
+    """Simulate the substeps of the thesis's program in float64; also return the velocity of the last displacement."""
     position, heading, velocity = (np.float64(x) for x in (state.position, state.heading, state.velocity))
     target = np.clip(np.float64(action), -1, 1) * [10, np.pi]
     for _ in range(10):
@@ -41,8 +41,8 @@ def simulate(name, is_torus, state, action):
     return position, heading, velocity, world_velocity
 
 
-def crowd(num_agents=200):
-    """Anywhere, many of them about to hit a wall, with any speeds and actions that are partly too large."""
+def random_agents(num_agents=200):
+    """Draw agents, many of them close to a wall, with random speeds, and actions of which some exceed the bounds."""
     keys = jax.random.split(jax.random.key(0), 4)
     position = jax.random.uniform(keys[0], (num_agents, 2), maxval=SIDE)
     heading = jax.random.uniform(keys[1], (num_agents,), maxval=2 * math.pi)
@@ -52,14 +52,14 @@ def crowd(num_agents=200):
     )
 
 
-def still(x, y, heading):
+def agent_at_rest(x, y, heading):
     return Agents(jnp.array([[x, y]]), jnp.array([heading]), jnp.zeros((1, 2)), jnp.zeros((1, 5)))
 
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", DYNAMICS)
 def test_a_step_is_ten_explicit_euler_steps(name, space):
-    state, action = crowd()
+    state, action = random_agents()
     position, heading, velocity, world_velocity = simulate(name, isinstance(space, Torus), state, action)
     moved = DYNAMICS[name]().move(space, state, action)
     np.testing.assert_allclose(moved.position, position, atol=5e-6)
@@ -73,14 +73,14 @@ def test_a_step_is_ten_explicit_euler_steps(name, space):
 
 @pytest.mark.parametrize("name", DYNAMICS)
 def test_actions_are_clipped(name):
-    state, action = crowd()
+    state, action = random_agents()
     move = DYNAMICS[name]().move
     chosen, clipped = move(SPACES[0], state, action), move(SPACES[0], state, jnp.clip(action, -1, 1))
     jax.tree.map(np.testing.assert_array_equal, chosen, clipped)
 
 
 def test_full_throttle_approaches_full_speed_with_damping():
-    motion, state = Acceleration(), still(0.0, 0.0, 0.0)
+    motion, state = Acceleration(), agent_at_rest(0.0, 0.0, 0.0)
     for step in range(1, 4):
         state = motion.move(Torus(SIDE), state, jnp.array([[1.0, -1.0]]))
         reached = 1 - 0.99 ** (10 * step)
@@ -89,32 +89,32 @@ def test_full_throttle_approaches_full_speed_with_damping():
 
 def test_speeds_do_not_pass_their_limits():
     motion = Acceleration(max_speed=2.0, max_turn_rate=1.0, max_acceleration=1000.0, max_turn_acceleration=1000.0)
-    velocity = motion.move(Plane(SIDE), still(5.0, 5.0, 0.0), jnp.array([[1.0, -1.0]])).velocity
+    velocity = motion.move(Plane(SIDE), agent_at_rest(5.0, 5.0, 0.0), jnp.array([[1.0, -1.0]])).velocity
     np.testing.assert_array_equal(velocity, [[2, -1]])
     np.testing.assert_array_equal(motion.proprioception(velocity), [[1, -1]])
 
 
 def test_without_action_speeds_decay():
-    state = still(5.0, 5.0, 0.0).replace(velocity=jnp.array([[4.0, 2.0]]))
+    state = agent_at_rest(5.0, 5.0, 0.0).replace(velocity=jnp.array([[4.0, 2.0]]))
     moved = Acceleration().move(Torus(SIDE), state, jnp.zeros((1, 2)))
     np.testing.assert_allclose(moved.velocity, 0.99**10 * state.velocity, rtol=1e-5)
 
 
 def test_walls_stop_agents_but_not_their_speed():
-    state = still(9.9, 5.0, 0.0).replace(velocity=jnp.array([[10.0, 0.0]]))
+    state = agent_at_rest(9.9, 5.0, 0.0).replace(velocity=jnp.array([[10.0, 0.0]]))
     moved = Acceleration().move(Plane(SIDE), state, jnp.array([[1.0, 0.0]]))
     np.testing.assert_array_equal(moved.position, [[10, 5]])
     np.testing.assert_allclose(moved.velocity, [[10, 0]], rtol=1e-5)
 
 
 def test_the_torus_lets_agents_through():
-    moved = Velocity().move(Torus(SIDE), still(9.9, 5.0, 0.0), jnp.array([[1.0, 0.0]]))
+    moved = Velocity().move(Torus(SIDE), agent_at_rest(9.9, 5.0, 0.0), jnp.array([[1.0, 0.0]]))
     np.testing.assert_allclose(moved.position, [[0.9, 5]], atol=1e-5)
 
 
 @pytest.mark.parametrize("max_turn_rate", [math.pi, 2 * math.pi])
 def test_constant_commands_trace_a_regular_polygon(max_turn_rate):
-    start, move = still(5.0, 5.0, 1.0), jax.jit(Velocity(max_turn_rate=max_turn_rate).move)
+    start, move = agent_at_rest(5.0, 5.0, 1.0), jax.jit(Velocity(max_turn_rate=max_turn_rate).move)
     num_steps = round(2 * math.pi / max_turn_rate / 0.1)
     state, corners = start, []
     for _ in range(num_steps):
@@ -128,7 +128,7 @@ def test_constant_commands_trace_a_regular_polygon(max_turn_rate):
 
 
 def test_without_inertia_the_velocity_is_the_command_and_nobody_sees_it():
-    moved = Velocity().move(Plane(SIDE), still(5.0, 5.0, 0.0), jnp.array([[-0.5, 0.25]]))
+    moved = Velocity().move(Plane(SIDE), agent_at_rest(5.0, 5.0, 0.0), jnp.array([[-0.5, 0.25]]))
     heading, velocity = moved.heading, moved.velocity
     np.testing.assert_allclose(velocity, [[-5, math.pi / 4]])
     np.testing.assert_array_equal(Velocity().world_velocity(heading, velocity), jnp.zeros((1, 2)))
@@ -136,7 +136,7 @@ def test_without_inertia_the_velocity_is_the_command_and_nobody_sees_it():
 
 
 def test_headings_stay_where_they_are_fine():
-    state, move = still(5.0, 5.0, 3.0), jax.jit(Velocity().move)
+    state, move = agent_at_rest(5.0, 5.0, 3.0), jax.jit(Velocity().move)
     for _ in range(12):
         state = move(Plane(SIDE), state, jnp.ones((1, 2)))
         assert jnp.abs(state.heading).max() <= 3.1416

@@ -1,4 +1,4 @@
-"""An exported policy is the policy, for any number of agents, without this package."""
+"""An exported policy agrees with the policy for any number of agents, and runs without this package."""
 
 import subprocess
 import sys
@@ -30,10 +30,10 @@ def inputs(obs):
 
 
 def check(task, network):
-    """The exported program agrees with the policy, for the whole swarm and for one agent of it."""
+    """Check that the exported program agrees with the policy, for the whole swarm and for one of its agents."""
     obs = jax.jit(lambda: task.observe(task.reset(KEY)))()
     params = jax.jit(network.init)(KEY, obs)
-    params = jax.tree.map(lambda x: x + 0.1, params)  # means differ from 0
+    params = jax.tree.map(lambda x: x + 0.1, params)  # otherwise the means are almost 0
     exported = jax_export.deserialize(export.export_policy(task, network, params).serialize())
     expected = jax.jit(lambda: network.apply(params, obs, method="policy"))()
     own, groups = inputs(obs)
@@ -72,7 +72,7 @@ def test_the_file_needs_jax_only(run_dir, tmp_path, capsys):
     assert program.main([str(run_dir)]) == 0
     out = capsys.readouterr().out
     assert f"wrote {run_dir / 'policy.jax'}" in out
-    assert "own is float32[agents,3], groups {neighbors: (float32[agents,2,8], bool[agents,2])}" in out
+    assert "own is float32[agents,3], groups is {neighbors: (float32[agents,2,8], bool[agents,2])}" in out
     experiment, params = jaxswarm.load(run_dir)
     obs = jax.jit(lambda: experiment.task.observe(experiment.task.reset(KEY)))()
     group = obs.groups["neighbors"]
@@ -98,7 +98,7 @@ def test_a_policy_is_exported_for_more_agents(run_dir, tmp_path, capsys):
         (["train_seed=3"], "train_seed: must be one of the trained seeds"),
         (["num_envs=3"], "num_envs cannot be changed here"),
         (["task.dynamics=velocity"], "observations of other sizes"),
-        (["nowhere"], "give one run folder, not 2"),
+        (["nowhere"], "give one run folder, got 2"),
     ],
 )
 def test_a_wrong_export_is_one_line(run_dir, tmp_path, capsys, overrides, part):

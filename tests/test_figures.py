@@ -1,4 +1,4 @@
-"""Figures of the thesis: their configs against its numbers, claims on made-up curves, and one trained end to end."""
+"""Figures of the thesis: configs compared with its numbers, claims on synthetic curves, and one figure end to end."""
 
 import dataclasses
 import functools
@@ -24,8 +24,9 @@ MEAN_OPT, ATTENTIVE = ((174, 226, 96), (97,), "relu"), ((72,), (132, 200), "leak
 RENDEZVOUS_OPT = ((146, 120), (19, 177, 162), "tanh")
 CLUSTERING_OPT = ((146, 120), (60, 177, 162), "leaky_relu")
 
-# What was run: agent steps per iteration, batch, iterations; of each series worlds, aggregator, learner, network and
-# number of parameters. Where the thesis's data does not say how many worlds there were, ours have 20.
+# Runs of the thesis: agent steps per iteration, batch size, iterations; for each series the number of environments,
+# aggregator, learner, network and number of parameters. Where the thesis's data does not contain the number of
+# environments, it is 20 here.
 RUNS = {
     "fig_6_1": (164_000, 1000, 160, {
         "Bayes agg. (medium)": (10, "bayesian", "ppo", MEDIUM, 52_405),
@@ -111,7 +112,7 @@ RUNS = {
         "Max Agg.": (20, "max", "ppo", MEDIUM, 70_965),
     }),
 }  # fmt: skip
-BEST = [f"best_{task}" for task in configs.choices()["task"]]  # our own
+BEST = [f"best_{task}" for task in configs.choices()["task"]]  # figures that are not in the thesis
 LEARNING = {"learning_rate": 3e-4, "adam_epsilon": 1e-5, "num_epochs": 10, "bootstrap_truncation": False}
 TINY = [
     *("task.num_agents=3", "task.num_evaders=1", "task.episode_length=5", "num_envs=2", "num_steps=4"),
@@ -121,7 +122,7 @@ TINY = [
 
 @functools.cache
 def observation(task):
-    """Its shapes, which take a while for boxes."""
+    """Return the shapes of an observation. The cache saves time, because tasks with boxes trace slowly."""
     return jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
 
 
@@ -131,7 +132,7 @@ def compose(overrides):
 
 
 def num_parameters(experiment, counted={}):  # noqa: B006
-    """Of actor and critic, heads and standard deviation; once for networks that see the same features."""
+    """Return the number of parameters of actor and critic. Networks with the same features are counted only once."""
     obs, network = observation(experiment.task), experiment.network
     features = {name: group.features.shape[-1] for name, group in obs.groups.items()}
     key = (network, obs.own.shape[-1], tuple(sorted(features.items())))
@@ -221,7 +222,7 @@ def test_final_levels_and_steps_are_those_that_the_thesis_was_measured_to_have()
 
 
 def ramp(final, steps, end=100.0, num_seeds=16):
-    """From 0 in a straight line to a final level at `steps`, with quartiles 2 apart."""
+    """Return a line that rises linearly from 0 to `final` at `steps`, with quartiles 2 apart."""
     x = np.arange(1.0, end + 1)
     y = final * np.minimum(x / steps, 1)
     return Line(x, y, y - 1, y + 1, np.full(len(x), num_seeds))
@@ -317,7 +318,7 @@ def test_claims_about_the_beginning_need_no_more_than_that(kind, fields, outcome
     ("spread", "room", "outcome"),
     [(0.0, 0.5, "reproduced"), (5.0, 0.5, "not enough runs"), (0.1, -1.0, "not reproduced")],
 )
-def test_verdicts_take_that_redrawn_seeds_agree(spread, room, outcome):
+def test_verdicts_require_that_bootstrapped_seeds_agree(spread, room, outcome):
     rng, x = np.random.default_rng(0), np.arange(1.0, 101)
     seeds = [Curve(x, np.full(100, 10 + spread * noise)) for noise in rng.normal(size=16)]
     line = curves.summarize(seeds, "median")
@@ -332,7 +333,7 @@ def test_verdicts_take_that_redrawn_seeds_agree(spread, room, outcome):
 
 @pytest.fixture
 def trained(tmp_path):
-    """Makes a run folder of figure 6.15's first series that looks as if these seeds had been trained."""
+    """Return a function that writes a run folder of figure 6.15's first series as if these seeds had been trained."""
 
     def write(name, seed, num_seeds, level=1.0, **changes):
         overrides = figures.load_figure("fig_6_15").series["μ only"]
@@ -385,7 +386,7 @@ def test_a_seed_that_two_folders_hold_counts_once(trained, tmp_path):
 
 def test_of_the_best_third_of_seeds_only_these_are_shown(trained, tmp_path):
     figure = dataclasses.replace(figures.load_figure("fig_6_15"), best_share=1 / 3, num_seeds=6)
-    trained("six", 0, 6)  # seed s is at 1 + s
+    trained("six", 0, 6)  # the return of seed s is 1 + s
     found = figures.find_runs(tmp_path)
     ours = figures.measure(figure, figures.plan(figure, tmp_path, found), found, lambda text: None)["μ only"]
     assert (ours.num_seeds, figure.num_shown) == (2, 2)
@@ -412,11 +413,11 @@ def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
     assert f"warning: {odd} belongs to no figure" in capsys.readouterr().err
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| μ only | 2 |" in report
-    assert "Trained on cpu, revisions of the code: 0123456789ab." in report
+    assert "The runs on cpu used these revisions of the code: 0123456789ab." in report
     kept = tmp_path / "out" / "runs" / "mine"
     assert {path.name for path in kept.iterdir()} == {"config.yaml", "manifest.json", "metrics.csv"}
     assert not (kept.parent / "odd").exists()
-    shutil.rmtree(tmp_path / "mine")  # of what was reported all that matters is in the report's folder
+    shutil.rmtree(tmp_path / "mine")  # the folder of the report contains everything that it needs
     shutil.rmtree(tmp_path / "odd")
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
     assert (tmp_path / "out" / "report.md").read_text() == report
@@ -447,7 +448,7 @@ def test_equal_series_of_figures_share_a_run_and_scale_shortens_it(tmp_path):
     assert (first.settings.num_seeds, second.settings.num_seeds) == (16, 16)
 
 
-def test_wrong_words_are_errors(capsys):
+def test_wrong_overrides_are_errors(capsys):
     with pytest.raises(ConfigError, match="fig_6_1, "):
         figures.load_figure("fig_9_9")
     for overrides, message in [
@@ -478,7 +479,7 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     assert program.main([*overrides, "scale=0.006"]) == 0  # trains the other one
     assert "run was cut" in capsys.readouterr().out
     assert program.main([*overrides, "scale=0.006"]) == 0  # nothing is left to train
-    assert program.main([*overrides, "scale=0.01"]) == 0  # goes on in the same folders
+    assert program.main([*overrides, "scale=0.01"]) == 0  # resumes in the same folders
     assert lengths == [3, 3, 4, 4]
     folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}
     assert len(folders) == 2
@@ -486,7 +487,7 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiments, "names", lambda: ["fig_6_5", "fig_6_15"])
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}", *TINY]) == 0
     report = (tmp_path / "out" / "report.md").read_text()
-    assert "| Bayesian agg. | 2 | 0.0 |" in report  # of the other figure
+    assert "| Bayesian agg. | 2 | 0.0 |" in report  # from the run of the other figure
     assert "| Mean agg. | 0 | not run |" in report
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
-    assert (tmp_path / "out" / "report.md").read_text().count("Not run.") == 2
+    assert (tmp_path / "out" / "report.md").read_text().count("This figure was not run.") == 2

@@ -1,7 +1,8 @@
-"""Rows of metrics.csv survive anything that may happen to the file."""
+"""Rows of metrics.csv survive truncated lines, removed rows and missing files."""
 
 import math
 
+import numpy as np
 import pytest
 
 from jaxswarm import files
@@ -20,9 +21,8 @@ def path(tmp_path):
 
 
 def test_rows_come_back_in_single_precision_with_the_leading_columns_first(path):
-    assert (
-        path.read_text().splitlines()[0] == "update,agent_steps,wall_seconds,seed,eval/return,eval/return_std,train/x"
-    )
+    header = path.read_text().splitlines()[0]
+    assert header == "update,agent_steps,wall_seconds,seed,eval/return,eval/return_std,train/x"
     rows = files.read_rows(path)
     assert [row["update"] for row in rows] == [0, 5, 10]
     assert np.float32(rows[1]["eval/return"]) == np.float32(-100 / 6)

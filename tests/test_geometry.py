@@ -11,7 +11,7 @@ from jaxswarm.physics.geometry import Plane, Torus, bearing, direction, norm, un
 SIDE = 100.0
 SPACES = [Plane(SIDE), Torus(SIDE)]
 
-# Multiples of 1/64 are exact in float32, and so are their sums: what holds for real numbers holds to the last bit.
+# Multiples of 1/64 and their sums are exact in float32, so that identities of real numbers hold bit for bit.
 several = settings(max_examples=30, deadline=None)
 
 
@@ -50,7 +50,7 @@ def test_displacement_on_the_torus_is_the_shortest_to_any_image(a, b):
 def test_displacement_on_the_torus_does_not_change_when_both_ends_are_shifted(a, b, shift):
     space = Torus(SIDE)
     displacement = np.asarray(space.displacement(a, b))
-    assume((np.abs(displacement) != SIDE / 2).all())  # half a world apart, two vectors are the shortest
+    assume((np.abs(displacement) != SIDE / 2).all())  # at half a side, two vectors are shortest
     shifted = space.displacement(space.confine(a + shift[:1]), space.confine(b + shift[:1]))
     np.testing.assert_array_equal(shifted, displacement)
 

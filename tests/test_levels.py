@@ -11,8 +11,9 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 LEVELS = [
-    {"types", "checks", "scene", "files", "config.schema"},
-    {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "config.plugins", "export.program"},
+    {"types", "checks", "scene", "files", "config.schema", "config.renamed"},
+    {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "export.program"},
+    {"config.plugins", "config.settings", "config.overrides"},
     {"physics.dynamics", "physics.neighbors", "physics.collisions", "aggregators.monoids", "aggregators.attentive"},
     {"physics.rigid2d", "tasks.swarm", "tasks.evasion", "aggregators.features", "physics", "bridges.gymnax"},
     {"tasks.rendezvous", "tasks.pursuit", "tasks.arena", "aggregators", "bridges", "export"},
@@ -23,7 +24,9 @@ LEVELS = [
     {"learners.projections"},
     {"learners.ppo", "learners.trl"},
     {"learners"},
-    {"training"},
+    {"training", "config.groups"},
+    {"config.keys"},
+    {"config.composition", "config.conversion"},
     {"config", "host.checkpoint", "host.progress", "host.manifest", "host.ensemble"},
     {"analysis.curves", "render.film", "host.loggers"},
     {"analysis.plots", "render.page", "render.pictures"},
@@ -38,7 +41,7 @@ LEVELS = [
     {"studies.grid", "figures.figure"},
     {"figures.report"},
     {"studies", "figures"},
-    {"cli.program"},
+    {"cli.program", "cli.help"},
     {"cli.policy_options"},
     {"cli.train", "cli.evaluate", "cli.plot", "cli.render", "cli.export"},
     {"cli.sweep", "cli.figure"},

@@ -17,7 +17,7 @@ EXPECTED = [(0, "eval/return", -9.0), (500, "eval/return", -4.5), (500, "learner
 
 
 def records(path):
-    """Contents of the records of a TensorBoard file: length, checksum of it, content, checksum of that."""
+    """Return the contents of the records of a TensorBoard file: length, its checksum, content, its checksum."""
     data = path.read_bytes()
     while data:
         (length,) = struct.unpack("<Q", data[:8])
@@ -26,7 +26,10 @@ def records(path):
 
 
 def chunks(path):
-    """Contents of a W&B file: after seven bytes, blocks of 32 KiB with pieces of checksum, length, kind and content."""
+    """Return the contents of a W&B file.
+
+    The file has 7 bytes, then blocks of 32 KiB with parts of checksum, length, kind and content.
+    """
     data, position, content = path.read_bytes(), 7, b""
     while position + 7 <= len(data):
         if position % 32768 > 32768 - 7:
@@ -35,7 +38,7 @@ def chunks(path):
         length, kind = struct.unpack("<HB", data[position + 4 : position + 7])
         content += data[position + 7 : position + 7 + length]
         position += 7 + length
-        if kind in (1, 4):  # the whole, or the last piece
+        if kind in (1, 4):  # a complete record, or its last part
             yield content
             content = b""
 

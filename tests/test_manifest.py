@@ -1,4 +1,4 @@
-"""The manifest of a run."""
+"""Content of the manifest of new and resumed runs."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Networks reproduce recorded outputs, have the documented sizes and initial weights."""
+"""Networks reproduce recorded outputs and have the documented sizes and initial weights."""
 
 import re
 from functools import partial
@@ -23,7 +23,7 @@ ARCHITECTURES = {
 
 
 def random_observation(num_rows=1, own=3, **groups):
-    """Groups of 3 entities with so many features each."""
+    """Return an observation with groups of 3 entities; `groups` are their numbers of features."""
 
     def entities(i, dim):
         return Entities(jax.random.normal(jax.random.key(i), (num_rows, 3, dim)), jnp.ones((num_rows, 3), bool))
@@ -111,7 +111,7 @@ def test_initial_weights_of_attention_are_those_of_the_thesis():
     tree = jax.jit(model.init)(jax.random.key(0), rendezvous_like())["params"]
     for tower in ("actor", "critic"):
         weights = tree[tower]["neighbors_aggregator"]
-        bound = np.sqrt(6 / (4 * 72))  # Xavier's, of a matrix from 72 to 3 * 72
+        bound = np.sqrt(6 / (4 * 72))  # of the Xavier initialization, for a matrix from 72 to 3 * 72
         assert 0.99 * bound < np.abs(weights["in_kernel"]).max() <= bound
         assert np.std(weights["in_kernel"]) == pytest.approx(bound / np.sqrt(3), rel=0.02)
         np.testing.assert_allclose(np.linalg.svd(weights["out_kernel"], compute_uv=False), np.sqrt(2), rtol=1e-4)
@@ -119,7 +119,7 @@ def test_initial_weights_of_attention_are_those_of_the_thesis():
             np.testing.assert_array_equal(weights[bias], 0.0)
 
 
-def assert_same_outputs(one, one_tree, two, two_tree, obs):
+def assert_same_values(one, one_tree, two, two_tree, obs):
     values = (
         jax.jit(partial(model.apply, method="value"))({"params": x}, obs)
         for model, x in ((one, one_tree), (two, two_tree))
@@ -146,7 +146,7 @@ def test_separate_encoders_of_the_same_weights_are_a_shared_one():
     split_tree = tree | {name: split(tree[name]) for name in ("actor", "critic")}
     expected = jax.eval_shape(separate.init, jax.random.key(0), obs)["params"]
     assert jax.tree.map(jnp.shape, split_tree) == jax.tree.map(jnp.shape, expected)
-    assert_same_outputs(shared, tree, separate, split_tree, obs)
+    assert_same_values(shared, tree, separate, split_tree, obs)
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_a_second_stage_is_further_layers_that_all_groups_share(variance_encoder
     merged = tree | {name: merge(tree[name]) for name in ("actor", "critic")}
     expected = jax.eval_shape(one_stage.init, jax.random.key(0), obs)["params"]
     assert jax.tree.map(jnp.shape, merged) == jax.tree.map(jnp.shape, expected)
-    assert_same_outputs(two_stages, tree, one_stage, merged, obs)
+    assert_same_values(two_stages, tree, one_stage, merged, obs)
 
 
 @pytest.mark.parametrize("name", AGGREGATORS)
@@ -224,7 +224,7 @@ def test_with_linear_output_layers_only_hidden_layers_bend(widths):
     between = jax.tree.map(lambda x, y: x if x.dtype == bool else 0.3 * x + 0.7 * y, one, two)
     tree = jax.jit(model.init)(jax.random.key(0), one)
     straight = 0.3 * model.apply(tree, one)[1] + 0.7 * model.apply(tree, two)[1]
-    off = np.abs(model.apply(tree, between)[1] - straight)[[0, 2]]  # the row between is its own mirror image
+    off = np.abs(model.apply(tree, between)[1] - straight)[[0, 2]]  # reversing does not move the middle row
     assert (off < 1e-5).all() if not widths else (off > 1e-4).all()
 
 
@@ -268,7 +268,7 @@ def test_a_standard_deviation_of_the_state_starts_near_1_and_differs_between_sta
 
 @pytest.mark.parametrize("latent_space", ["separate", "shared"])
 def test_shares_of_entities_by_group(latent_space):
-    """Those of one aggregate sum to 1; of a mean, all that are present are equal."""
+    """The shares of one aggregate sum to 1; with a mean, all present entities have equal shares."""
     obs = pursuit_like(2)
     neighbors, evaders = obs.groups["neighbors"], obs.groups["evaders"]
     obs = obs.replace(
@@ -292,3 +292,31 @@ def test_shares_are_those_of_the_actor():
     expected = (e / e.sum(1, keepdims=True)).mean(-1)
     shares = jax.jit(partial(model.apply, method="weights"))(tree, obs)
     np.testing.assert_allclose(shares["evaders"], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("features", lambda x: x[:1]),
+        ("features", lambda x: x[0]),
+        ("mask", lambda x: x[:, 1:]),
+    ],
+)
+def test_groups_that_do_not_fit_the_receivers_are_named(field, change):
+    obs = pursuit_like(2)
+    group = obs.groups["evaders"]
+    wrong = obs.replace(groups=obs.groups | {"evaders": group.replace(**{field: change(getattr(group, field))})})
+    with pytest.raises(ValueError, match=rf"obs\.groups\['evaders'\]\.{field}: must have the shape \(2, .*, got"):
+        jax.eval_shape(ActorCritic().init, jax.random.key(0), wrong)
+
+
+def test_a_mask_of_other_receivers_is_named():
+    obs = pursuit_like(2)
+    with pytest.raises(ValueError, match=r"obs\.mask: must have the shape \(2,\), got \(3,\)"):
+        jax.eval_shape(ActorCritic().init, jax.random.key(0), obs.replace(mask=jnp.ones(3, bool)))
+
+
+def test_the_observation_of_a_single_agent_has_no_leading_axes():
+    obs = jax.tree.map(lambda x: x[0], pursuit_like(2))
+    policy, value = jax.eval_shape(lambda: ActorCritic().init_with_output(jax.random.key(0), obs)[0])
+    assert (policy.loc.shape, value.shape) == ((2,), ())

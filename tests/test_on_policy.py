@@ -1,5 +1,6 @@
-"""Advantages against their definition, values across resets, and the shuffling of samples."""
+"""Advantages follow their definition, values hold across resets, samples are shuffled, and hyperparameters checked."""
 
+import inspect
 from functools import partial
 
 import jax
@@ -16,13 +17,13 @@ from jaxswarm.types import Observation, pytree, static
 
 
 def advantages_by_definition(reward, is_terminal, is_done, value, next_value, discount, gae_lambda):
-    """Sum of discounted temporal differences up to the end of the episode."""
+    """Return the sums of discounted temporal differences up to the end of the episode."""
     result = np.zeros_like(value)
     for t in range(len(reward)):
         weight = 1.0
         for u in range(t, len(reward)):
-            following = np.where(is_terminal[u], 0.0, next_value[u])
-            result[t] += weight * (reward[u] + discount * following - value[u])
+            bootstrap = np.where(is_terminal[u], 0.0, next_value[u])
+            result[t] += weight * (reward[u] + discount * bootstrap - value[u])
             if is_done[u]:
                 break
             weight *= discount * gae_lambda
@@ -49,9 +50,9 @@ def test_for_an_agent_that_dies_its_last_step_is_the_end():
     rng = np.random.default_rng(1)
     reward, never = rng.normal(size=(6, 1)).astype(np.float32), np.zeros((6, 1), bool)
     value, next_value = rng.normal(size=(2, 6, 1, 2)).astype(np.float32)
-    is_gone = np.zeros((6, 1, 2), bool)
-    is_gone[2:, :, 1] = True  # the second agent dies in the third step
-    found = ADVANTAGES(reward, never, never, value, next_value, 0.9, 0.8, is_gone)
+    is_next_absent = np.zeros((6, 1, 2), bool)
+    is_next_absent[2:, :, 1] = True  # the second agent dies in the third step
+    found = ADVANTAGES(reward, never, never, value, next_value, 0.9, 0.8, is_next_absent)
     is_over = np.arange(6) == 2
     parts = (reward[:, 0], never[:, 0], never[:, 0], value[:, 0, 0], next_value[:, 0, 0])
     np.testing.assert_allclose(found[:, 0, 0], advantages_by_definition(*parts, 0.9, 0.8), atol=1e-5)
@@ -61,7 +62,7 @@ def test_for_an_agent_that_dies_its_last_step_is_the_end():
 
 @pytree
 class Dying:
-    """As many agents as there are steps left, of four."""
+    """Task whose number of agents is 4 minus the state; `observe` returns the mask of present agents."""
 
     num_agents: int = static(default=4)
 
@@ -75,9 +76,9 @@ def test_agents_are_gone_after_the_step_in_which_they_die():
     time = jnp.arange(3)[:, None]
     trajectory = random_trajectory(PROBES["delayed reward"])[2]
     trajectory = trajectory.replace(final_state=time + 1, reward=jnp.zeros((3, 1)), mask=jnp.ones((3, 1, 4), bool))
-    gone = on_policy.gone_after(Dying(), trajectory)
-    np.testing.assert_array_equal(gone[:, 0].sum(-1), [1, 2, 3])
-    assert not on_policy.gone_after(Dying(), trajectory.replace(mask=None)).any()
+    absent = on_policy.next_absent(Dying(), trajectory)
+    np.testing.assert_array_equal(absent[:, 0].sum(-1), [1, 2, 3])
+    assert not on_policy.next_absent(Dying(), trajectory.replace(mask=None)).any()
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 7), (4, 1), (2, 8), (164, 1000), (3, 5), (100, 1), (50, 3)])
@@ -87,8 +88,8 @@ def test_shuffling_is_a_permutation(rows, columns):
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(100, 1), (100, 2), (32, 8)])
-def test_neighbours_do_not_follow_each_other(rows, columns):
-    """In time, that is: sample i + 1 is in the minibatch after that of sample i as often as any other."""
+def test_neighbors_do_not_follow_each_other(rows, columns):
+    """Sample i + 1 is in the minibatch after that of sample i as often as any other sample."""
     keys = jax.random.split(jax.random.key(2), 500)
     order = jax.jit(jax.vmap(lambda key: on_policy.shuffled(key, rows, columns)))(keys).reshape(500, -1)
     minibatch = np.argsort(np.asarray(order), axis=1) // columns
@@ -103,8 +104,8 @@ def test_every_sample_is_as_likely_in_every_minibatch(rows, columns):
     order = jax.jit(jax.vmap(lambda key: on_policy.shuffled(key, rows, columns)))(keys).reshape(num_draws, -1)
     minibatch = np.argsort(np.asarray(order), axis=1) // columns  # of each sample
     assert np.abs((minibatch == 0).mean(0) - 1 / rows).max() < 5 / np.sqrt(rows * num_draws)
-    together = (minibatch[:, :1] == minibatch).mean(0)[1:]  # with sample 0: neighbors are no more alike than others
-    assert np.abs(together - (columns - 1) / (rows * columns - 1)).max() < 5 / np.sqrt(rows * num_draws)
+    is_with_first = (minibatch[:, :1] == minibatch).mean(0)[1:]  # the samples after the first are no exception
+    assert np.abs(is_with_first - (columns - 1) / (rows * columns - 1)).max() < 5 / np.sqrt(rows * num_draws)
 
 
 def random_trajectory(task, num_steps=6, num_envs=3, std="shared"):
@@ -115,9 +116,9 @@ def random_trajectory(task, num_steps=6, num_envs=3, std="shared"):
     @jax.jit
     def play():
         params = network.init(jax.random.key(0), task.observe(task.reset(jax.random.key(0))))
-        worlds = rollout.start(jax.random.key(1), task, num_envs, is_desynchronized=False)
+        envs = rollout.start(jax.random.key(1), task, num_envs, is_desynchronized=False)
         policy = partial(network.apply, params, method="policy")
-        _, trajectory, metrics = rollout.collect(jax.random.key(2), task, policy, worlds, num_steps, reset_pool=2)
+        _, trajectory, metrics = rollout.collect(jax.random.key(2), task, policy, envs, num_steps, reset_pool=2)
         return params, trajectory, metrics
 
     return network, *play()
@@ -137,8 +138,8 @@ def test_values_after_a_step_are_those_of_the_state_before_any_reset():
 def test_fetched_samples_are_those_of_the_trajectory():
     task = PROBES["delayed reward"]
     _, _, trajectory, _ = random_trajectory(task)
-    steps, worlds, agents = trajectory.log_prob.shape
-    number = jnp.arange(steps * worlds * agents, dtype=jnp.float32).reshape(steps, worlds, agents)
+    steps, envs, agents = trajectory.log_prob.shape
+    number = jnp.arange(steps * envs * agents, dtype=jnp.float32).reshape(steps, envs, agents)
     samples = on_policy.stored_samples(task, trajectory, number, -number)
     batch = on_policy.fetch_agents(task, samples, jnp.array([5, 0, 33]))
     np.testing.assert_array_equal(batch.advantage, [5, 0, 33])
@@ -181,13 +182,13 @@ def test_statistics_are_those_of_the_rows_that_exist():
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(2, 20)).astype(np.float32)
     mask = rng.random(20) < 0.5
-    kept, kept_y = x[mask], y[mask]
-    expected = (kept - kept.mean()) / kept.std(ddof=1)
+    present, present_y = x[mask], y[mask]
+    expected = (present - present.mean()) / present.std(ddof=1)
     np.testing.assert_allclose(on_policy.standardized(jnp.array(x), jnp.array(mask))[mask], expected, atol=1e-5)
-    np.testing.assert_allclose(on_policy.mean(jnp.array(x), jnp.array(mask)), kept.mean(), atol=1e-6)
-    np.testing.assert_allclose(on_policy.maximum(jnp.array(x**2), jnp.array(mask)), (kept**2).max())
+    np.testing.assert_allclose(on_policy.mean(jnp.array(x), jnp.array(mask)), present.mean(), atol=1e-6)
+    np.testing.assert_allclose(on_policy.maximum(jnp.array(x**2), jnp.array(mask)), (present**2).max())
     explained = on_policy.explained_variance(jnp.array(x), jnp.array(y), jnp.array(mask))
-    np.testing.assert_allclose(explained, 1 - (kept_y - kept).var() / kept_y.var(), rtol=1e-5)
+    np.testing.assert_allclose(explained, 1 - (present_y - present).var() / present_y.var(), rtol=1e-5)
     everywhere = np.ones(20, bool)
     for function in (on_policy.standardized, on_policy.mean):
         np.testing.assert_allclose(
@@ -228,3 +229,37 @@ def test_impossible_hyper_parameters_are_named(learner):
     }.items():
         with pytest.raises(ValueError, match=f"{field}: must be .*, got {value!r}"):
             LEARNERS[learner](**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("terminated", lambda x: x[1:]),
+        ("log_prob", lambda x: x[..., 1:]),
+        ("action_std", lambda x: x[..., :0]),
+        ("state", lambda x: jax.tree.map(lambda leaf: leaf[:, 1:], x)),
+    ],
+)
+def test_trajectories_with_other_leading_axes_are_refused(field, change):
+    task = PROBES["delayed reward"]
+    axes, state = (6, 3, 2), jax.eval_shape(jax.vmap(jax.vmap(task.reset)), jax.random.split(jax.random.key(0), (6, 3)))
+    actions, flags = jax.ShapeDtypeStruct((*axes, 1), jnp.float32), jax.ShapeDtypeStruct(axes[:2], bool)
+    reward, log_prob = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in (axes[:2], axes))
+    right = rollout.Trajectory(state, actions, log_prob, actions, actions, reward, flags, flags, state, None)
+    jax.eval_shape(on_policy.check_trajectory, right)
+
+    def check(trajectory):
+        on_policy.check_trajectory(trajectory.replace(**{field: change(getattr(trajectory, field))}))
+
+    with pytest.raises(ValueError, match=r"trajectory: must have .* axes|trajectory: must have actions"):
+        jax.eval_shape(check, right)
+
+
+def test_agents_of_advantages_have_next_values():
+    flags, value = jnp.zeros((6, 1), bool), jnp.zeros((6, 1, 2))
+    args = (jnp.zeros((6, 1)), flags, flags, value)
+    unchecked = inspect.unwrap(on_policy.generalized_advantages)  # without the run-time types of the tests
+    with pytest.raises(ValueError, match="different shapes"):
+        unchecked(*args, value[..., :1], 0.9, 0.8)
+    with pytest.raises(ValueError, match=r"expected \(6, 1, None\)"):
+        unchecked(*args, value[1:], 0.9, 0.8)

@@ -1,4 +1,4 @@
-"""The recorded update of the original trainer is reproduced."""
+"""PPO reproduces the recorded updates of the original trainer."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ AGGREGATION = {
 
 
 def complete(meta):
-    """The recorded updates leave out what all of them share."""
+    """Add the settings that all recorded updates share, which the recording omits."""
     layout = meta["layout"] | {"order": ["local", "aggregatables"]}
     common = {"agg_mode": AGGREGATION[meta["agg"]], "agg_into_space": "separate", "out_hidden": []}
     return meta | common | {"layout": layout}
@@ -40,10 +40,14 @@ by_case = pytest.mark.parametrize(
 
 
 def recorded_advantages(meta, arrays):
-    """Advantages from the recorded values; the original stores whether an observation is the first of its episode."""
+    """Return advantages from the recorded values.
+
+    The original stores whether an observation is the first of its episode.
+    """
     is_done = np.concatenate([arrays["episode_start"][1:], arrays["last_done"][None]]).astype(bool)
     next_value = np.concatenate([arrays["values"][1:], arrays["last_values"][None]])
-    value, next_value = arrays["values"][..., None], next_value[..., None]  # every agent is a world of its own there
+    # In the original, every agent is an environment of its own.
+    value, next_value = arrays["values"][..., None], next_value[..., None]
     steps = [jnp.asarray(x) for x in (arrays["rewards"], is_done, is_done, value, next_value)]
     return on_policy.generalized_advantages(*steps, meta["gamma"], meta["gae_lambda"])[..., 0]
 
@@ -90,13 +94,13 @@ def test_recorded_update(meta, arrays):
         np.concatenate([np.abs(a - b).reshape(-1) for a, b in zip(*map(jax.tree.leaves, trees), strict=True)])
         for trees in ((before, after), (state.params, after))
     )
-    assert moved.max() > 2e-4  # something was learned
+    assert moved.max() > 2e-4
     assert deviation.max() < 1e-5 * meta["n_epochs"]
     logged = meta["logged"]
     assert float(metrics["value_loss"]) == pytest.approx(logged["train/value_loss"], rel=1e-4)
     assert float(metrics["policy_loss"]) == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
     assert float(metrics["entropy"]) == pytest.approx(-logged["train/entropy_loss"], rel=1e-5)
-    if meta["n_epochs"] == 1:  # the original logs the last epoch's
+    if meta["n_epochs"] == 1:  # the original logs the last epoch only
         assert float(metrics["approx_kl"]) == pytest.approx(logged["train/approx_kl"], abs=1e-6)
     explained = on_policy.explained_variance(jnp.asarray(arrays["values"]), jnp.asarray(arrays["returns"]), None)
     assert float(explained) == pytest.approx(logged["train/explained_variance"], abs=1e-3)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import CASES, OPTIONS, PROBES, look, train_probes
+from probes import CASES, OPTIONS, PROBES, policy_and_value, train_probes
 from test_projections import cov_distance, mean_distance
 
 from jaxswarm import LEARNERS
@@ -15,12 +15,12 @@ from jaxswarm.learners.projections import PROJECTIONS
 
 @pytest.fixture(scope="module", params=CASES)
 def outputs(request):
-    """Action and value by (probe, cue, time) after training all probes side by side."""
+    """Action and value as a function of (probe, cue, time), after the vectorized training of all probes."""
     results = train_probes(*request.param)
 
     def output(probe, cue, time):
         params = jax.tree.map(lambda x: x[-1], results[probe][0])
-        policy, value = look(params, cue, time)
+        policy, value = policy_and_value(params, cue, time)
         return float(policy.mean()[0]), float(value)
 
     output.returns = {probe: returns for probe, (_, returns) in results.items()}
@@ -61,7 +61,7 @@ def test_best_action_that_depends_on_the_observation(outputs, cue):
 @partial(jax.vmap, in_axes=(None, 0, 0))
 @partial(jax.vmap, in_axes=(0, None, None))
 def mean_and_std(params, cue, time):
-    policy, _ = look(params, cue, time)
+    policy, _ = policy_and_value(params, cue, time)
     return policy.mean(), policy.stddev()
 
 
@@ -69,7 +69,10 @@ def mean_and_std(params, cue, time):
 @pytest.mark.parametrize("probe", PROBES)
 @pytest.mark.parametrize("name", PROJECTIONS)
 def test_successive_policies_are_within_the_bounds(name, probe):
-    """The standard deviation exactly; the mean, which is only drawn back, on average at most twice as far."""
+    """The standard deviation is exactly within its bound, the mean on average within twice its bound.
+
+    Only the regression loss draws the mean back.
+    """
     params, _ = train_probes("trl", name)[probe]
     mean_bound, cov_bound = LEARNERS["trl"]().mean_bound, LEARNERS["trl"]().cov_bound
     states = jnp.array([-1, -1, 1, 1]), jnp.array([0, 1, 0, 1])
@@ -77,6 +80,6 @@ def test_successive_policies_are_within_the_bounds(name, probe):
     (mean, old_mean), (std, old_std) = ((x[:, 1:], x[:, :-1]) for x in (mean, std))
     assert cov_distance(name, std, old_std).max() <= cov_bound * 1.001
     assert mean_distance(name, mean, old_mean, old_std).mean(0).max() <= mean_bound * 2
-    if name in ("kl", "wasserstein"):  # whose bounds are bounds of the divergence, whatever the scale
+    if name in ("kl", "wasserstein"):  # only their bounds limit the divergence for any standard deviation
         divergence = mean_distance("kl", mean, old_mean, old_std) + cov_distance("kl", std, old_std)
         assert divergence.mean(0).max() <= mean_bound * 2 + cov_bound * 1.1

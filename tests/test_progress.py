@@ -1,4 +1,4 @@
-"""Progress on terminals, in logs and in notebooks."""
+"""Progress display in logs and in notebooks."""
 
 from jaxswarm.host.progress import Progress
 
@@ -24,7 +24,7 @@ def test_silent_progress_says_nothing(capsys):
 
 
 def test_notebooks_without_widgets_get_lines(capsys, monkeypatch):
-    """There, rich would warn and draw a bar that does not move."""
+    """Without ipywidgets, rich warns and draws a bar that does not move."""
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with Progress(0, 2, 500) as progress:

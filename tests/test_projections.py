@@ -1,4 +1,4 @@
-"""Projections against recorded ones, and what must hold for any policies. Distances are written again, in float64."""
+"""Projections match recorded ones and are correct for random policies; distances are reimplemented in float64."""
 
 import json
 from functools import partial
@@ -50,7 +50,7 @@ def project(name, mean, std, old_mean, old_std, mean_bound, cov_bound):
 
 
 def project_and_pull_back(name, *arguments, weights):
-    """Projection, and the gradient of the sum of its weighted entries."""
+    """Return the projection and the gradient of the weighted sum of its entries."""
     return jax.tree.map(np.asarray, _project_and_pull_back(name, *arguments, weights))
 
 
@@ -62,7 +62,10 @@ def _project_and_pull_back(name, mean, std, old_mean, old_std, mean_bound, cov_b
 
 
 def recorded_inputs(meta, recorded, dtype):
-    """Arguments of `project`, one row a policy; in further dimensions nothing changes, so one program does for all."""
+    """Return the arguments of `project`, one policy per row.
+
+    Padding with dimensions that do not change lets one program serve all cases.
+    """
 
     def padded(name, neutral):
         x = np.broadcast_to(recorded[name], (NUM_ROWS, meta["dim"]))
@@ -74,7 +77,7 @@ def recorded_inputs(meta, recorded, dtype):
 
 
 def recorded_outputs(meta, recorded, outputs):
-    """Projection and gradient without the further dimensions; of a shared standard deviation one row, summed."""
+    """Return projection and gradient without padding; a shared standard deviation has one row and a summed gradient."""
     (mean, std), (mean_gradient, std_gradient) = jax.tree.map(lambda x: x[:, : meta["dim"]], outputs)
     if meta["is_shared"]:
         return mean, std[:1], mean_gradient, std_gradient.sum(0, keepdims=True)
@@ -82,7 +85,7 @@ def recorded_outputs(meta, recorded, outputs):
 
 
 def gradient_scale(meta, recorded):
-    """Length of what the gradient of a row's standard deviation would be if all of it came through the projection."""
+    """Return the gradient norm per row of the standard deviation if the projection passed on the whole gradient."""
     scale = recorded["w_std"].astype(float)
     scale = scale.sum(0, keepdims=True) if meta["is_shared"] else scale
     return np.linalg.norm(scale * recorded["proj_std"] / recorded["std"], axis=-1, keepdims=True)
@@ -130,7 +133,7 @@ def test_large_bounds_are_met_too(bound):
 
 
 def policies(least_std, largest_std, least_bound):
-    """Rows of arguments of `project` with such standard deviations; changes and bounds are of any size."""
+    """Generate arguments of `project` with standard deviations in this range; changes and bounds have any size."""
 
     def rows(seed, change, *bounds):
         rng = np.random.default_rng(seed)
@@ -150,8 +153,8 @@ def policies(least_std, largest_std, least_bound):
     )
 
 
-def check(arguments, **more):
-    """Hypothesis for one compiled program: many rows each, so few examples."""
+def for_every_kind(arguments, **more):
+    """Run a property test for every projection; each example has many rows, so few examples suffice."""
     return lambda test: every_kind(settings(max_examples=15, deadline=None)(given(arguments=arguments, **more)(test)))
 
 
@@ -165,7 +168,7 @@ def parts(name, mean, std, old_mean, old_std):
     return mean_distance(name, mean, old_mean, old_std), cov_distance(name, std, old_std)
 
 
-@check(ORDINARY)
+@for_every_kind(ORDINARY)
 def test_projected_policies_are_within_the_bounds(name, arguments):
     *policies, mean_bound, cov_bound = arguments
     projected, _ = project_and_pull_back(name, *arguments, weights=WEIGHTS)
@@ -174,7 +177,7 @@ def test_projected_policies_are_within_the_bounds(name, arguments):
     assert cov_part.max() <= cov_bound * 1.002
 
 
-@check(ORDINARY)
+@for_every_kind(ORDINARY)
 def test_what_is_within_a_bound_comes_back_bit_by_bit_and_the_rest_at_the_bound(name, arguments):
     *policies, mean_bound, cov_bound = arguments
     projected, gradient = project_and_pull_back(name, *arguments, weights=WEIGHTS)
@@ -186,7 +189,7 @@ def test_what_is_within_a_bound_comes_back_bit_by_bit_and_the_rest_at_the_bound(
         np.testing.assert_allclose(after[i][is_outside], bound, rtol=2e-3)
 
 
-@check(ORDINARY)
+@for_every_kind(ORDINARY)
 def test_projecting_again_changes_nothing(name, arguments):
     once, _ = project_and_pull_back(name, *arguments, weights=WEIGHTS)
     twice, _ = project_and_pull_back(name, *once, *arguments[2:], weights=WEIGHTS)
@@ -194,7 +197,7 @@ def test_projecting_again_changes_nothing(name, arguments):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-@check(ORDINARY, order=st.permutations(range(3)))
+@for_every_kind(ORDINARY, order=st.permutations(range(3)))
 def test_dimensions_have_no_order(name, arguments, order):
     order = list(order)
     projected, _ = project_and_pull_back(name, *arguments, weights=WEIGHTS)
@@ -204,7 +207,7 @@ def test_dimensions_have_no_order(name, arguments, order):
         np.testing.assert_allclose(a[:, order], b, rtol=1e-5, atol=1e-5)
 
 
-@check(EXTREME)
+@for_every_kind(EXTREME)
 def test_no_policy_is_too_extreme(name, arguments):
     projected, gradient = project_and_pull_back(name, *arguments, weights=WEIGHTS)
     assert all(np.isfinite(x).all() for x in (*projected, *gradient))
@@ -224,7 +227,7 @@ def test_gradients_are_finite_differences(name):
 
     @jax.jit
     def along(x):
-        """The projection of policies on a line, and its derivative."""
+        """Return the projection of policies on a line, and its derivative."""
 
         def at(x):
             moved = (jnp.asarray(a) + x * jnp.asarray(d) for a, d in zip((mean, std), directions, strict=True))
@@ -240,7 +243,7 @@ def test_gradients_are_finite_differences(name):
         np.testing.assert_allclose(d[rows], (a - b)[rows] / (2 * step), atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["kl"])  # the only one with more than elementwise formulas
+@pytest.mark.parametrize("name", ["kl"])  # the only projection with more than elementwise formulas
 def test_bounds_can_be_swept_inside_a_scan(name):
     rng = np.random.default_rng(1)
     mean, std, old_mean, old_std = (jnp.asarray(np.exp(rng.normal(size=(NUM_ROWS, 3))), jnp.float32) for _ in range(4))
@@ -273,7 +276,7 @@ def test_recorded_entropy_control(meta, kind, is_equality):
 @pytest.mark.parametrize("meta", META["entropy_schedule"], ids=lambda m: f"{m['kind']}-{m['step']}")
 def test_recorded_entropy_schedules(meta):
     is_linear = meta["kind"] == "linear"
-    target = meta["target"] * (1 if is_linear else meta["dim"])  # the original's exponential one is per dimension
+    target = meta["target"] * (1 if is_linear else meta["dim"])  # the original exponential schedule is per dimension
     schedule = ENTROPY_SCHEDULES["linear" if is_linear else "exponential"]
     result = schedule(meta["h0"], target, meta["step"] / meta["total"], meta["temperature"])
     assert result == pytest.approx(meta["beta"], rel=1e-6)

@@ -1,4 +1,4 @@
-"""Recorded episodes of the thesis's program, closed forms, and the order of events.
+"""Tests of pursuit against recorded episodes of the thesis's program, closed forms and the order of events.
 
 `golden/pursuit.npz` holds numbered cases, see `golden/README.md`; index 0 of states is the start.
 """
@@ -63,19 +63,19 @@ def place(task, **fields):
 
 @functools.partial(jax.jit, static_argnames="every")
 def transitions(task, position, heading, evader_position, actions, every):
-    """One step from each recorded state, and the observations of some."""
+    """Simulate one step from each recorded state, and observe every `every`-th state."""
 
     def state(x):
         return task.reset(KEY).replace(position=x[0], heading=x[1], evader_position=x[2])
 
     recorded = (position, heading, evader_position)
-    before = jax.tree.map(lambda x: x[:-1], recorded)
-    steps = jax.vmap(lambda x, action: task.step(KEY, state(x), action))(before, actions)
+    states = jax.tree.map(lambda x: x[:-1], recorded)
+    steps = jax.vmap(lambda x, action: task.step(KEY, state(x), action))(states, actions)
     return *steps, jax.vmap(lambda x: task.observe(state(x)))(jax.tree.map(lambda x: x[::every], recorded))
 
 
 @functools.cache
-def replayed(number):
+def replay(number):
     case = CASES[number]
     arrays = (record(case, name) for name in ("pos", "angle", "evader_pos", "actions"))
     return transitions(recorded_task(case), *arrays, every=case["obs_every"])
@@ -83,42 +83,42 @@ def replayed(number):
 
 @golden_cases
 def test_recorded_agents_move_as_recorded(case):
-    states, _, _ = replayed(case["case"])
+    states, _, _ = replay(case["case"])
     np.testing.assert_allclose(states.position, record(case, "pos")[1:], atol=1.6e-5, rtol=0)
     np.testing.assert_allclose(np.exp(1j * states.heading), np.exp(1j * record(case, "angle")[1:]), atol=1e-6)
 
 
 @golden_cases
 def test_recorded_evaders_move_as_recorded(case):
-    """Except those that were put somewhere at random. At a wall the original often finds no direction, and stays."""
-    states, _, _ = replayed(case["case"])
-    off = np.abs(states.evader_position - record(case, "evader_pos")[1:]).max(-1)
-    is_followed = (record(case, "evader_dir") != 0).any(-1)
+    """Evaders that restart at random are excluded. At a wall the original often finds no direction and stays."""
+    states, _, _ = replay(case["case"])
+    error = np.abs(states.evader_position - record(case, "evader_pos")[1:]).max(-1)
+    is_compared = (record(case, "evader_dir") != 0).any(-1)
     if case["torus"]:
-        assert is_followed.all()
-    is_followed[record(case, "respawn_step"), record(case, "respawn_evader")] = False
-    assert off[is_followed].max() < 2e-4
+        assert is_compared.all()
+    is_compared[record(case, "respawn_step"), record(case, "respawn_evader")] = False
+    assert error[is_compared].max() < 2e-4
 
 
 @golden_cases
 def test_recorded_rewards_and_ends_are_reproduced(case):
-    _, steps, _ = replayed(case["case"])
-    is_followed = (record(case, "evader_dir") != 0).any((1, 2)) | (case["reward_mode"] == "count_catches")
-    np.testing.assert_allclose(steps.reward[is_followed], record(case, "reward")[is_followed], atol=2e-6)
-    np.testing.assert_array_equal(steps.terminated[is_followed], record(case, "done")[is_followed])
+    _, steps, _ = replay(case["case"])
+    is_compared = (record(case, "evader_dir") != 0).any((1, 2)) | (case["reward_mode"] == "count_catches")
+    np.testing.assert_allclose(steps.reward[is_compared], record(case, "reward")[is_compared], atol=2e-6)
+    np.testing.assert_array_equal(steps.terminated[is_compared], record(case, "done")[is_compared])
     if case["reward_mode"] == "count_catches":
         np.testing.assert_array_equal(steps.reward, record(case, "caught"))
 
 
 @golden_cases
 def test_recorded_observations_are_reproduced(case):
-    """Bearings to those closer than a unit may be off by as much more as float32 positions are coarser there."""
-    _, _, obs = replayed(case["case"])
+    """The tolerance of bearings grows below a distance of one unit, where float32 positions are relatively coarser."""
+    _, _, obs = replay(case["case"])
     num_agents, num_local = case["n_agents"], case["n_local"]
     sizes = [num_local, num_local + 6 * (num_agents - 1)]
     own, neighbors, evaders = np.split(record(case, "obs"), sizes, axis=-1)
     np.testing.assert_allclose(obs.own, own, atol=1e-6)
-    # Recorded rows stand in the order of their index, visible ones first; neighbors of ours in cyclic order.
+    # Recorded rows are in the order of their index, visible ones first; our neighbors are in cyclic order.
     cyclic = (np.arange(num_agents)[:, None] + np.arange(1, num_agents)) % num_agents
     in_order = np.broadcast_to(np.arange(case["n_evaders"]), (num_agents, case["n_evaders"]))
     for group, rows, index, radius in (
@@ -129,9 +129,9 @@ def test_recorded_observations_are_reproduced(case):
         order = np.argsort(np.where(group.mask, index, num_agents + 99), axis=-1, kind="stable")
         np.testing.assert_array_equal(np.take_along_axis(np.asarray(group.mask), order, 2), rows[..., -1] == 1)
         features = np.take_along_axis(np.asarray(group.features), order[..., None], 2)
-        off = np.abs(features - rows[..., :-1])
-        assert off[..., 0].max() < 1e-6
-        assert (off[..., 1:] < 2e-6 + 1e-5 / np.maximum(rows[..., :1] * radius, 1e-3)).all()
+        error = np.abs(features - rows[..., :-1])
+        assert error[..., 0].max() < 1e-6
+        assert (error[..., 1:] < 2e-6 + 1e-5 / np.maximum(rows[..., :1] * radius, 1e-3)).all()
 
 
 def test_an_agent_sees_an_evader_as_the_formulas_say():
@@ -168,29 +168,31 @@ def test_the_reward_is_the_smallest_distance_after_the_move():
     np.testing.assert_allclose(outcome.reward, -distance / task.evader_visibility_radius, rtol=1e-5)
     assert outcome.reward > -0.5
     short_sighted = task.replace(evader_visibility_radius=5.0)
-    assert step(short_sighted, state, jnp.zeros((2, 2)))[1].reward == -1  # nobody is closer than that
+    assert step(short_sighted, state, jnp.zeros((2, 2)))[1].reward == -1  # the evader is farther away than that
 
 
 def test_an_evader_is_twice_as_fast_as_an_agent_and_stays_in_its_world():
     task = Pursuit(num_agents=1, torus=False)
     state = place(task, position=[[50, 50]], evader_position=[[50, 60]])
-    after, _ = step(task, state, jnp.zeros((1, 2)))
-    np.testing.assert_allclose(after.evader_position, [[50, 62]], atol=1e-5)
+    next_state, _ = step(task, state, jnp.zeros((1, 2)))
+    np.testing.assert_allclose(next_state.evader_position, [[50, 62]], atol=1e-5)
     state = place(task, position=[[50, 90]], evader_position=[[50, 99]])
-    after, _ = step(task, state, jnp.zeros((1, 2)))
-    assert after.evader_position[0, 1] <= 100
+    next_state, _ = step(task, state, jnp.zeros((1, 2)))
+    assert next_state.evader_position[0, 1] <= 100
 
 
 def test_a_catch_ends_the_single_pursuit():
-    task = Pursuit(num_agents=1, evader_visibility_radius=0.5, episode_length=3)  # the evader does not see it coming
+    task = Pursuit(
+        num_agents=1, evader_visibility_radius=0.5, episode_length=3
+    )  # the evader does not see the agent in time
     state = place(task, position=[[50, 50]], heading=[0], evader_position=[[52.9, 50]]).replace(time=jnp.array(1))
     forward = jnp.array([[1.0, 0.0]])
     state, outcome = step(task, state, forward)
-    assert not outcome.terminated  # at 1.9 units
+    assert not outcome.terminated  # the distance is 1.9 units
     assert np.isnan(outcome.metrics["capture_time"])
     _, outcome = step(task, state, forward)
     assert outcome.terminated
-    assert not outcome.truncated  # though it is the last step, too
+    assert not outcome.truncated  # a catch in the last step terminates the episode
     assert outcome.metrics["caught"] == outcome.metrics["catches"] == 1
     assert outcome.metrics["capture_time"] == 2
 
@@ -199,17 +201,18 @@ def test_evaders_caught_start_anew_and_move_in_the_same_step():
     task = Pursuit(num_agents=3, num_evaders=2, reward="catches")
     state = place(task, position=[[50, 50], [51, 50], [90, 90]], evader_position=[[50.5, 50.5], [10, 10]])
     state = state.replace(evader_age=jnp.array([7, 30]), catches=jnp.array(3))
-    after, outcome = step(task, state, jnp.zeros((3, 2)))
-    assert outcome.reward == 1  # though two agents were at it
+    next_state, outcome = step(task, state, jnp.zeros((3, 2)))
+    assert outcome.reward == 1  # two agents that catch one evader get one reward
     assert outcome.metrics["capture_time"] == 7
-    np.testing.assert_array_equal(after.evader_age, [1, 31])
-    assert after.catches == 4
-    assert np.linalg.norm(after.evader_position[0] - state.evader_position[0]) > 2.1
-    np.testing.assert_allclose(np.linalg.norm(after.evader_position[1] - state.evader_position[1]), 2, rtol=1e-5)
+    np.testing.assert_array_equal(next_state.evader_age, [1, 31])
+    assert next_state.catches == 4
+    moved = np.linalg.norm(next_state.evader_position - state.evader_position, axis=-1)
+    assert moved[0] > 2.1
+    np.testing.assert_allclose(moved[1], 2, rtol=1e-5)
 
 
 def test_a_catch_counts_in_the_step_after():
-    """The evader comes within 2 units by the agents' move; that pays in the next step, even if it gets away there."""
+    """An evader within 2 units after the agents' move is rewarded in the next step, even if it escapes in that step."""
     task = Pursuit(num_agents=1, num_evaders=1, reward="catches", evader_visibility_radius=0.5)
     state = place(task, position=[[50, 50]], heading=[0], evader_position=[[52.5, 50]])
     forward = jnp.array([[1.0, 0.0]])
@@ -262,9 +265,9 @@ def test_the_order_of_agents_and_evaders_does_not_matter():
     obs, permuted_obs = observe(task, state), observe(task, permuted)
     for group in ("neighbors", "evaders"):
         np.testing.assert_allclose(by_distance(permuted_obs, group), by_distance(obs, group)[order], atol=1e-6)
-    after, outcome = step(task, state, action)
-    permuted_after, permuted_outcome = step(task, permuted, action[order])
-    np.testing.assert_allclose(permuted_after.evader_position, after.evader_position[evader_order], atol=1e-5)
+    next_state, outcome = step(task, state, action)
+    permuted_next, permuted_outcome = step(task, permuted, action[order])
+    np.testing.assert_allclose(permuted_next.evader_position, next_state.evader_position[evader_order], atol=1e-5)
     np.testing.assert_allclose(permuted_outcome.reward, outcome.reward, rtol=1e-5)
 
 

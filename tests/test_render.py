@@ -1,4 +1,4 @@
-"""Films are whole episodes with the shares of the network; pages and pictures hold all that was to be seen."""
+"""Tests of films, which record complete episodes with the weights of the network, and of pages and image files."""
 
 import base64
 import dataclasses
@@ -34,7 +34,7 @@ class Clock:
 
 @pytree
 class Countdown:
-    """A task that is over after `length` steps; the reward is their number. Nobody sees the third of its agents."""
+    """A task that terminates after `length` steps, with the step number as reward; no agent perceives the third."""
 
     length: int = 4
     num_agents: int = static(default=3)
@@ -60,19 +60,20 @@ class Countdown:
 
 
 class Standing:
-    """A network that does nothing, and tells of weights."""
+    """A network with zero actions and fixed weights."""
 
     def apply(self, params, obs, method):
         if method == "weights":
             return {"neighbors": jnp.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]])}
-        return gaussian(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
+        zeros = jnp.zeros((*obs.own.shape[:-1], 2))
+        return gaussian(zeros, zeros)
 
 
 def test_a_film_ends_where_the_episode_ends():
     film = render.record(Countdown(), Standing(), None, max_shares=1)
     np.testing.assert_array_equal(film.score, [0, 1, 3, 6, 10])
     np.testing.assert_array_equal(film.scenes.agents.position[:, 0, 0], [0, 1, 2, 3, 4])
-    assert film.shares is None  # two frames of them would be too large
+    assert film.shares is None  # the shares of two frames exceed the limit
 
 
 @pytest.mark.parametrize(("length", "kept"), [(100, 5), (4, 3)])
@@ -85,36 +86,36 @@ def test_shares_are_kept_of_so_many_frames_and_by_the_number_of_the_body(length,
 
 
 def unpack(text):
-    about = json.loads(re.search(r'<script id="about"[^>]*>(.*?)</script>', text, re.S)[1])
+    metadata = json.loads(re.search(r'<script id="metadata"[^>]*>(.*?)</script>', text, re.S)[1])
     data = re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1]
-    return about, zlib.decompress(base64.b64decode(data))
+    return metadata, zlib.decompress(base64.b64decode(data))
 
 
 @pytest.mark.parametrize("kinds", [{"num_evaders": 2}, {"num_boxes": 4}])
 def test_a_page_holds_what_the_film_shows(kinds):
     film = episode(**kinds)
-    about, data = unpack(page.html([film, film]))
-    assert [x["title"] for x in about["films"]] == [film.title] * 2
-    told = about["films"][1]
-    arrays = {name: np.frombuffer(data[a:b], page.TYPES[kind]) for name, (a, b, kind) in told["arrays"].items()}
+    metadata, data = unpack(page.html([film, film]))
+    assert [x["title"] for x in metadata["films"]] == [film.title] * 2
+    second = metadata["films"][1]
+    arrays = {name: np.frombuffer(data[a:b], page.TYPES[dtype]) for name, (a, b, dtype) in second["arrays"].items()}
     for role, bodies in film.scenes.kinds.items():
         codes = arrays[f"{role}.position"].reshape(bodies.position.shape)
         np.testing.assert_allclose(codes / 65534 * 100, bodies.position, atol=100 / 65534)
-        assert told["kinds"][role]["count"] == bodies.position.shape[1]
-    turned = arrays["agents.heading"].reshape(film.scenes.agents.heading.shape) * (np.pi / 128)
-    assert np.cos(turned - film.scenes.agents.heading).min() > np.cos(np.pi / 255)
+        assert second["kinds"][role]["count"] == bodies.position.shape[1]
+    heading = arrays["agents.heading"].reshape(film.scenes.agents.heading.shape) * (np.pi / 128)
+    assert np.cos(heading - film.scenes.agents.heading).min() > np.cos(np.pi / 255)
     shares = ((arrays["shares"].reshape(film.shares.shape).astype(float) - 1) / 254) ** 4
     np.testing.assert_allclose(shares, film.shares, rtol=0.03, atol=1e-4)
     np.testing.assert_allclose(arrays["score"], film.score, rtol=1e-6)
-    assert len(told["catches"]) == ("num_evaders" in kinds)
-    assert [goal["group"] for goal in told["goals"]] == ([0, 1] if "num_boxes" in kinds else [])
+    assert len(second["catches"]) == ("num_evaders" in kinds)
+    assert [goal["group"] for goal in second["goals"]] == ([0, 1] if "num_boxes" in kinds else [])
 
 
 def test_absent_bodies_and_those_not_perceived_have_codes_of_their_own():
     position, low, high = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]]), np.zeros(2), np.ones(2)
-    codes = page.quantise_positions(position, np.array([True, True, False]), low, high)
+    codes = page.quantize_positions(position, np.array([True, True, False]), low, high)
     np.testing.assert_array_equal(codes, [[0, 0], [65534, 65534], [65535, 65535]])
-    np.testing.assert_array_equal(page.quantise_shares(np.array([np.nan, 0.0, 1.0])), [0, 1, 255])
+    np.testing.assert_array_equal(page.quantize_shares(np.array([np.nan, 0.0, 1.0])), [0, 1, 255])
 
 
 def test_a_page_asks_for_nothing_from_outside():
@@ -133,7 +134,7 @@ def test_a_page_inside_of_a_notebook_is_the_page():
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_large_swarms_stay_below_10_mb(kept):
-    """200 agents, 1024 steps; random numbers are the worst that can be compressed."""
+    """The film has 200 agents, 1024 steps and random numbers, which compress worst."""
     film = episode(1025, 200, shares=False)
     if kept:
         every = -(-1025 // (MAX_SHARES // 200**2))
@@ -158,7 +159,7 @@ def test_suffixes_may_be_in_capitals_and_paths_texts(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["A.HTML"]
 
 
-def test_a_gif_has_so_many_pictures(tmp_path):
+def test_a_gif_has_the_given_number_of_frames(tmp_path):
     render.write(tmp_path / "a.gif", [episode(num_evaders=1)], frames=4)
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 4
@@ -197,8 +198,8 @@ def test_a_replay_in_the_run_folder(run_dir):
 
 def test_runs_are_rendered_side_by_side(run_dir, tmp_path, capsys):
     assert program.main([str(run_dir), str(run_dir), "checkpoint=last", "seed=2", f"out={tmp_path / 'two.html'}"]) == 0
-    about = unpack((tmp_path / "two.html").read_text())[0]
-    assert [film["title"] for film in about["films"]] == ["run, rendezvous of 3 agents, after update 1"] * 2
+    metadata = unpack((tmp_path / "two.html").read_text())[0]
+    assert [film["title"] for film in metadata["films"]] == ["run, rendezvous of 3 agents, after update 1"] * 2
     assert "5 steps, return -" in capsys.readouterr().out
 
 

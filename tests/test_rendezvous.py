@@ -1,4 +1,4 @@
-"""Recorded episodes of the thesis's program, closed forms, and symmetries.
+"""Tests of rendezvous against recorded episodes of the thesis's program, closed forms and symmetries.
 
 `golden/rendezvous.npz` holds numbered cases: for case k `cKKK_actions, pos, angle, p_vel, reward` at every step, as
 float32, and `cKKK_obs` at every `obs_every`-th; index 0 is the start. `meta_json` describes the cases.
@@ -42,7 +42,7 @@ def recorded_task(case):
 
 
 def recorded_states(case):
-    """Of all steps; agents without inertia do not look at their velocity, which is not recorded."""
+    """Return the states of all steps; velocities are recorded only for agents with inertia, which need them."""
     position, heading = record(case, "pos"), record(case, "angle")
     has_velocity = case["dynamics"] == "unicycle_acc"
     velocity = record(case, "p_vel") if has_velocity else np.zeros_like(position)
@@ -57,13 +57,13 @@ def at(states, index):
 
 @jax.jit
 def transitions(task, states, actions):
-    """One step from each recorded state."""
+    """Simulate one step from each recorded state."""
     return jax.vmap(lambda state, action: task.step(KEY, state, action))(at(states, slice(-1)), actions)
 
 
 @jax.jit
 def replay(task, states, actions):
-    """All steps from the first state."""
+    """Simulate all steps from the first state."""
 
     def body(state, action):
         state, step = task.step(KEY, state, action)
@@ -115,7 +115,7 @@ def test_recorded_episodes_are_reproduced(case):
 
 @golden_cases
 def test_recorded_observations_are_reproduced(case):
-    """Bearings to neighbors closer than a unit may be off by as much more as float32 positions are coarser there."""
+    """The tolerance of bearings grows below a distance of one unit, where float32 positions are relatively coarser."""
     every, num_local, num_agents = case["obs_every"], case["n_local"], case["n_agents"]
     obs = observations(recorded_task(case), recorded_states(case), every)
     own, rows = np.split(record(case, "obs"), [num_local], axis=-1)
@@ -123,7 +123,7 @@ def test_recorded_observations_are_reproduced(case):
     neighbors = obs.groups["neighbors"]
     features, mask = np.asarray(neighbors.features), np.asarray(neighbors.mask)
 
-    # Recorded neighbors stand in the order of their index, visible ones first; ours in cyclic order from the agent on.
+    # Recorded neighbors are in the order of their index, visible ones first; ours are in cyclic order after the agent.
     index = (np.arange(num_agents)[:, None] + np.arange(1, num_agents)) % num_agents
     order = np.argsort(np.where(mask, index, num_agents), axis=-1, kind="stable")
     features, mask = np.take_along_axis(features, order[..., None], 2), np.take_along_axis(mask, order, 2)
@@ -134,11 +134,11 @@ def test_recorded_observations_are_reproduced(case):
     deviation = np.abs(features - rows[..., :8])
     assert (deviation[..., :1] < 1e-6).all()
     assert (deviation[..., 1:5] < 2e-6 + 1e-5 / np.maximum(distance, 1e-3)).all()
-    assert (deviation[..., 5:7] < 5e-5 + 1e-5 * np.abs(rows[..., 5:7])).all()  # of up to 100
+    assert (deviation[..., 5:7] < 5e-5 + 1e-5 * np.abs(rows[..., 5:7])).all()  # features of up to 100
     assert (deviation[..., 7] < 1e-6).all()
 
 
-def test_relative_velocities_of_the_thesis_are_100_times_the_normalised():
+def test_relative_velocities_of_the_thesis_are_100_times_the_normalized():
     task = Rendezvous(num_agents=4)
     state = task.reset(KEY).replace(velocity=jax.random.normal(KEY, (4, 2)))
     normalized, thesis = (
@@ -158,7 +158,7 @@ def test_two_agents_see_each_other_as_the_formulas_say():
         active_agents=jnp.array(2),
         time=jnp.array(0),
     )
-    assert not observe(task, state).groups["neighbors"].mask.any()  # at 5.0 exactly
+    assert not observe(task, state).groups["neighbors"].mask.any()  # the distance is exactly 5.0
     obs = observe(task.replace(visibility_radius=5.1), state)
     features = obs.groups["neighbors"].features
     np.testing.assert_allclose(obs.own, [[1, 0.2, 0], [1, 0.4, 0.5]], atol=1e-6)
@@ -189,7 +189,7 @@ def test_the_order_of_agents_does_not_matter(torus):
     np.testing.assert_allclose(permuted_outcome.reward, outcome.reward, rtol=1e-6)
 
 
-def test_a_torus_has_no_centre():
+def test_a_torus_has_no_center():
     task = Rendezvous(num_agents=5, torus=True, visibility_radius=40.0)
     state = task.reset(KEY)
     shifted = state.replace(position=jnp.mod(state.position + jnp.array([[37.0, 81.0]]), 100))
@@ -208,7 +208,7 @@ def test_agents_at_one_place_do_not_see_each_other():
 @pytest.mark.parametrize("num_agents", [2, 7, 20])
 def test_the_reward_is_the_mean_distance_and_a_price_of_action(num_agents):
     task = Rendezvous(num_agents=num_agents, visibility_radius=50.0)
-    action = 2 * jax.random.normal(KEY, (num_agents, 2))  # the price is that of the action as given
+    action = 2 * jax.random.normal(KEY, (num_agents, 2))  # the penalty is that of the unclipped action
     state, outcome = step(task, task.reset(KEY), action)
     difference = np.float64(state.position)[:, None] - np.float64(state.position)
     distance = np.linalg.norm(difference, axis=-1)[np.triu_indices(num_agents, 1)]
@@ -218,7 +218,7 @@ def test_the_reward_is_the_mean_distance_and_a_price_of_action(num_agents):
 
 
 def test_a_swarm_of_more_agents_than_pairs_can_be_counted():
-    """50 000 agents have 2.5e9 ordered pairs, and int32 ends at 2.1e9; only what scales with the pairs is computed."""
+    """50 000 agents have 2.5e9 ordered pairs, and int32 ends at 2.1e9. A stub replaces the neighbor search."""
     spread = jnp.full(50_000, 50_000.0)
     task = Rendezvous(num_agents=50_000)
     with pytest.MonkeyPatch.context() as patch:
@@ -243,7 +243,7 @@ def test_without_action_an_episode_scores_what_uniform_positions_predict():
     task = Rendezvous()
     states = jax.vmap(task.reset)(jax.random.split(KEY, 500))
     reward = jax.vmap(step, (None, 0, None))(task, states, jnp.zeros((20, 2)))[1].reward
-    mean_distance = 90 * (2 + np.sqrt(2) + 5 * np.arcsinh(1)) / 15  # of two points in a square
+    mean_distance = 90 * (2 + np.sqrt(2) + 5 * np.arcsinh(1)) / 15  # of two uniform points in a square
     np.testing.assert_allclose(1024 * reward.mean(), -1024 * mean_distance / (100 * np.sqrt(2)), atol=2)
 
 

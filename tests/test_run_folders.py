@@ -18,7 +18,7 @@ def default():
 
 @pytest.fixture
 def write(tmp_path, default):
-    """Writes a run folder: a config with some values changed, and returns by seed."""
+    """Return a function that writes a run folder from changes of the default config and the returns of each seed."""
 
     def write(name, returns, changes=(), eval_every=5):
         folder = tmp_path / name
@@ -122,11 +122,12 @@ def test_copies_and_continued_runs_count_once(write, tmp_path):
     for name, returns in (("a", [1.0, 2.0]), ("b", [1.0, 2.0, 3.0]), ("c", [1.0])):
         write(name, {0: returns})
     (members,) = group(tmp_path).values()
-    told = []
-    (curve,) = runs.seeds(members, "agent_steps", "eval/return", told.append)
+    warnings = []
+    (curve,) = runs.seeds(members, "agent_steps", "eval/return", warnings.append)
     assert curve.y.tolist() == [1, 2, 3]
     names = [(tmp_path / name, tmp_path / other) for name, other in (("b", "a"), ("c", "b"))]
-    assert told == [f"{name}: seed 0 is that of {other}; the longer one is counted" for name, other in names]
+    expected = [f"{name}: seed 0 is also in {other}; only the longer one is counted" for name, other in names]
+    assert warnings == expected
 
 
 def test_what_is_not_counted_is_told(write, tmp_path):
@@ -135,12 +136,12 @@ def test_what_is_not_counted_is_told(write, tmp_path):
     write("c", {0: [1.5]})
     (members,) = group(tmp_path).values()
     members.append(dataclasses.replace(members[0], rows=[], path=tmp_path / "empty"))
-    told = []
-    found = runs.seeds(members, "update", "eval/return", told.append)
+    warnings = []
+    found = runs.seeds(members, "update", "eval/return", warnings.append)
     assert [curve.y.tolist() for curve in found] == [[1, 5, 6], [1.5], [0]]
-    texts = ["2 evaluations left out", "seed 1 not counted", "seed 0 is that of", "empty: the run not counted"]
-    texts += [f"seed 0 occurs 2 times with different numbers, each is counted: {tmp_path / 'b'}, {tmp_path / 'c'}"]
-    assert all(text in line for text, line in zip(texts, told, strict=True)), told
+    texts = ["eval/return is not finite: 2", "left out seed 1", "seed 0 is also in", "empty: left out the run"]
+    texts += [f"seed 0 occurs 2 times with different values; each one is counted: {tmp_path / 'b'}, {tmp_path / 'c'}"]
+    assert all(text in line for text, line in zip(texts, warnings, strict=True)), warnings
 
 
 @pytest.mark.parametrize(

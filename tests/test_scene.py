@@ -1,4 +1,4 @@
-"""Tasks describe what is to be seen, and which body is in which slot of what agents perceive."""
+"""Tests of the scenes of tasks, and of `slots`, which maps the slots of observations to bodies of the scene."""
 
 import ast
 import functools
@@ -12,7 +12,7 @@ import pytest
 from jaxswarm import TASKS, scene
 
 CASES = {
-    "rendezvous, the nearest": ("rendezvous", {"num_agents": 6, "max_neighbors": 2, "visibility_radius": 50.0}),
+    "rendezvous, nearest only": ("rendezvous", {"num_agents": 6, "max_neighbors": 2, "visibility_radius": 50.0}),
     "rendezvous, some absent": ("rendezvous", {"num_agents": 6, "active_agents": (3, 3), "torus": True}),
     "pursuit": ("pursuit", {"num_agents": 4, "num_evaders": 3, "evader_visibility_radius": 40.0}),
     "assembly": ("assembly", {"num_agents": 3, "num_boxes": 4, "active_boxes": (2, 2)}),
@@ -24,19 +24,19 @@ every_task = pytest.mark.parametrize("case", CASES)
 
 
 @functools.cache
-def look(case):
-    """In a random state: what agents perceive, the bodies in the slots, and the scene."""
+def observe_random_state(case):
+    """Return the observation, the slots and the scene of a random state."""
     task = TASK[case]
 
     @jax.jit
-    def look(state):
+    def describe(state):
         return task.observe(state), task.slots(state), task.scene(state)
 
-    return look(random_state(task))
+    return describe(random_state(task))
 
 
 def random_state(task):
-    """All that is drawn at random is anywhere; as few take part as the task allows."""
+    """Draw a state with random values and the smallest possible number of active entities."""
     rng, low = np.random.default_rng(3), -0.5 if hasattr(task, "physics") else 0.0
     state = jax.eval_shape(task.reset, jax.random.key(0))
     values = {}
@@ -54,8 +54,8 @@ def random_state(task):
     return state.replace(**values)
 
 
-def bodies(picture):
-    return np.concatenate([np.asarray(kind.position) for kind in picture.kinds.values()])
+def positions(task_scene):
+    return np.concatenate([np.asarray(kind.position) for kind in task_scene.kinds.values()])
 
 
 def test_every_task_has_a_scene():
@@ -71,25 +71,25 @@ def test_scenes_need_numpy_only():
 
 @every_task
 def test_distances_perceived_are_those_to_the_bodies_in_the_slots(case):
-    """The first feature is the distance, up to a factor for each group."""
-    obs, slots, picture = look(case)
-    place, side = bodies(picture), float(picture.high[0] - picture.low[0])
+    """The first feature is proportional to the distance, with one factor per group."""
+    obs, slots, task_scene = observe_random_state(case)
+    position, side = positions(task_scene), float(task_scene.high[0] - task_scene.low[0])
     assert slots.keys() == obs.groups.keys()
     for name, group in obs.groups.items():
         mask, index = np.asarray(group.mask), np.asarray(slots[name])
         assert index.shape == mask.shape
         assert mask.any()
         assert (index[mask] >= 0).all()
-        way = place[index] - np.asarray(picture.agents.position)[:, None]
-        if picture.is_torus:
-            way -= side * np.round(way / side)
-        factor = np.asarray(group.features)[..., 0][mask] / np.linalg.norm(way, axis=-1)[mask]
+        displacement = position[index] - np.asarray(task_scene.agents.position)[:, None]
+        if task_scene.is_torus:
+            displacement -= side * np.round(displacement / side)
+        factor = np.asarray(group.features)[..., 0][mask] / np.linalg.norm(displacement, axis=-1)[mask]
         np.testing.assert_allclose(factor, factor[0], rtol=1e-4)
 
 
 @every_task
 def test_no_agent_has_a_body_in_two_slots_or_itself(case):
-    obs, slots, _ = look(case)
+    obs, slots, _ = observe_random_state(case)
     for agent in range(TASK[case].num_agents):
         seen = [
             int(i) for name, x in slots.items() for i in np.asarray(x[agent])[np.asarray(obs.groups[name].mask[agent])]
@@ -100,29 +100,29 @@ def test_no_agent_has_a_body_in_two_slots_or_itself(case):
 
 @every_task
 def test_scenes_are_in_the_world(case):
-    _, _, picture = look(case)
-    assert picture.num_bodies == len(bodies(picture))
-    assert (bodies(picture) >= np.asarray(picture.low)).all()
-    assert (bodies(picture) <= np.asarray(picture.high)).all()
+    _, _, task_scene = observe_random_state(case)
+    assert task_scene.num_bodies == len(positions(task_scene))
+    assert (positions(task_scene) >= np.asarray(task_scene.low)).all()
+    assert (positions(task_scene) <= np.asarray(task_scene.high)).all()
 
 
 def test_those_who_take_no_part_are_absent():
-    _, _, picture = look("rendezvous, some absent")
-    np.testing.assert_array_equal(picture.agents.is_present, [True] * 3 + [False] * 3)
-    _, _, picture = look("assembly")
-    np.testing.assert_array_equal(picture.boxes.is_present, [True] * 2 + [False] * 2)
+    _, _, task_scene = observe_random_state("rendezvous, some absent")
+    np.testing.assert_array_equal(task_scene.agents.is_present, [True] * 3 + [False] * 3)
+    _, _, task_scene = observe_random_state("assembly")
+    np.testing.assert_array_equal(task_scene.boxes.is_present, [True] * 2 + [False] * 2)
 
 
 def test_clusters_have_groups_and_corners():
-    _, _, picture = look("clustering")
-    np.testing.assert_array_equal(picture.boxes.group, [0, 0, 1, 1, 2])
-    np.testing.assert_array_equal(picture.goals.group, [0, 1, 2])
-    np.testing.assert_allclose(picture.goals.position, [[-0.5, -0.5], [0.5, 0.5], [0.5, -0.5]])
-    assert look("clustering, one-hot")[2].goals is None
+    _, _, task_scene = observe_random_state("clustering")
+    np.testing.assert_array_equal(task_scene.boxes.group, [0, 0, 1, 1, 2])
+    np.testing.assert_array_equal(task_scene.goals.group, [0, 1, 2])
+    np.testing.assert_allclose(task_scene.goals.position, [[-0.5, -0.5], [0.5, 0.5], [0.5, -0.5]])
+    assert observe_random_state("clustering, one-hot")[2].goals is None
 
 
 def test_caught_evaders_are_marked():
     task = TASK["pursuit"]
-    place = jnp.array([[10.5, 10.0], [60.0, 60.0], [11.5, 10.0]])
-    state = random_state(task).replace(position=jnp.full((4, 2), 10.0), evader_position=place)
+    evaders = jnp.array([[10.5, 10.0], [60.0, 60.0], [11.5, 10.0]])
+    state = random_state(task).replace(position=jnp.full((4, 2), 10.0), evader_position=evaders)
     np.testing.assert_array_equal(jax.jit(task.scene)(state).is_caught, [True, False, False])

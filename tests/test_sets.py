@@ -1,5 +1,6 @@
-"""However a group is laid out, and in however many pieces it is taken, an aggregator gives the same vector."""
+"""Aggregators return the same vectors in every layout and in any number of pieces; mismatched shapes are errors."""
 
+import dataclasses
 import functools
 
 import jax
@@ -24,18 +25,18 @@ EACH_REDUCTION = {AGGREGATOR[name].reduction: name for name in MONOIDS[::-1]}.va
 
 
 class Groups(nn.Module):
-    """Two groups of entities, aggregated together."""
+    """Network that encodes two groups of entities and aggregates them together."""
 
     aggregator: nn.Module
     layout: str | None = None
 
     @nn.compact
     def __call__(self, groups, own):
-        is_raw = self.aggregator.num_encoders == 0
+        has_encoder = self.aggregator.num_encoders > 0
         encoders = [Encoder((WIDTH,), "tanh", self.aggregator.num_parts, name=name) for name in ("one", "two")]
-        encoders = [ParallelEncoders(()) if is_raw else encoder for encoder in encoders]
+        encoders = encoders if has_encoder else [ParallelEncoders(())] * 2
         aggregator = self.aggregator.copy(name="pooling")
-        return sets.Pool(aggregator, tuple(encoders), DIM if is_raw else WIDTH, self.layout)(groups, own)
+        return sets.Pool(aggregator, tuple(encoders), WIDTH if has_encoder else DIM, self.layout)(groups, own)
 
 
 def groups(seed, slots=SLOTS):
@@ -62,7 +63,7 @@ def params_of(name):
     return jax.jit(Groups(AGGREGATOR[name]).init)(jax.random.key(1), *groups(0))
 
 
-CHOSEN = {name: output_and_gradient(name) for name in AGGREGATOR}
+FASTEST = {name: output_and_gradient(name) for name in AGGREGATOR}
 
 
 def assert_close(one, two):
@@ -74,7 +75,7 @@ def assert_close(one, two):
 def test_layouts_agree(name, layout):
     other = jax.jit(Groups(AGGREGATOR[name], layout).apply)
     for seed in range(10):
-        assert_close(other(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed))[0][1])
+        assert_close(other(params_of(name), *groups(seed)), FASTEST[name](params_of(name), *groups(seed))[0][1])
 
 
 @pytest.mark.parametrize("layout", ["streaming", "dense", "segments"])
@@ -82,19 +83,19 @@ def test_layouts_agree(name, layout):
 def test_layouts_agree_in_their_gradients(name, layout):
     other = output_and_gradient(name, layout)
     for seed in range(10):
-        assert_close(other(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed)))
+        assert_close(other(params_of(name), *groups(seed)), FASTEST[name](params_of(name), *groups(seed)))
 
 
 @pytest.mark.parametrize("name", ["bayesian", pytest.param("attentive, query", marks=pytest.mark.slow)])
 def test_pieces_agree_with_the_whole(name, monkeypatch):
     monkeypatch.setattr(
         sets,
-        "_PIECE",
+        "_PIECE_ELEMENTS",
         {"streaming": 2 * 2 * WIDTH, "dense": 2 * sum(SLOTS) * WIDTH, "segments": 2 * sum(SLOTS) * WIDTH},
     )
     pieces = output_and_gradient(name)
     for seed in range(5):
-        assert_close(pieces(params_of(name), *groups(seed)), CHOSEN[name](params_of(name), *groups(seed)))
+        assert_close(pieces(params_of(name), *groups(seed)), FASTEST[name](params_of(name), *groups(seed)))
 
 
 @pytest.mark.parametrize("name", AGGREGATOR)
@@ -106,7 +107,7 @@ def test_features_of_absent_entities_have_no_influence(name, scale):
     other = tuple(
         x.replace(features=jnp.where(x.mask[..., None], x.features, noise[:, : x.mask.shape[1]])) for x in pair
     )
-    one, two = (CHOSEN[name](params_of(name), x, own) for x in (pair, other))
+    one, two = (FASTEST[name](params_of(name), x, own) for x in (pair, other))
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
@@ -114,8 +115,8 @@ def test_features_of_absent_entities_have_no_influence(name, scale):
 def test_groups_without_slots_are_empty_groups(name):
     pair, own = groups(3)
     empty = tuple(x.replace(mask=jnp.zeros_like(x.mask)) for x in pair)
-    (_, one), gradient = CHOSEN[name](params_of(name), empty, own)
-    (_, two), no_slots_gradient = CHOSEN[name](params_of(name), groups(3, (0, 0))[0], own)
+    (_, one), gradient = FASTEST[name](params_of(name), empty, own)
+    (_, two), no_slots_gradient = FASTEST[name](params_of(name), groups(3, (0, 0))[0], own)
     np.testing.assert_array_equal(one, two)
     for leaf in jax.tree.leaves((one, gradient, no_slots_gradient)):
         assert np.isfinite(leaf).all()
@@ -134,8 +135,77 @@ def test_a_dense_view_has_the_messages_of_each_receiver_in_order(seed, bound):
     messages = 1.0 + jnp.arange(16.0).reshape(8, 2)
     lists = [[i for i in range(8) if receiver[i] == r and is_present[i]][:bound] for r in range(5)]
 
-    view = sets.dense_view(messages, segments.replace(is_present=sets.counts(segments)))
+    view = sets.dense_view(messages, segments.replace(is_present=sets.is_received(segments)))
     np.testing.assert_array_equal(view.mask.sum(1), [len(x) for x in lists])
     for r, entries in enumerate(lists):
         np.testing.assert_array_equal(view.messages[r, : len(entries)], messages[np.array(entries, int)])
     np.testing.assert_array_equal(view.messages[~view.mask], 0.0)
+
+
+MESSAGES = jnp.zeros((6, WIDTH))
+SEGMENTS = sets.segments_of(jnp.ones((3, 2), bool))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("receiver", jnp.zeros(5, jnp.int32)),
+        ("is_present", jnp.ones((3, 2), bool)),
+        ("own", jnp.zeros((2, 1))),
+    ],
+)
+def test_segments_that_do_not_fit_the_messages_are_named(field, value):
+    with pytest.raises(ValueError, match=rf"segments\.{field}: must have the shape .*, got \({value.shape[0]},"):
+        AGGREGATORS["mean"]().apply({}, MESSAGES, SEGMENTS.replace(**{field: value}))
+
+
+def test_groups_of_other_receivers_are_named():
+    pair, own = groups(0)
+    short = jax.tree.map(lambda x: x[1:], pair[1])
+    for wrong, name in (
+        ((pair[0], short), "features"),
+        ((pair[0], dataclasses.replace(pair[1], mask=short.mask)), "mask"),
+    ):
+        with pytest.raises(ValueError, match=rf"groups\[1\]\.{name}: must have the shape \(5, .*, got \(4, "):
+            Groups(AGGREGATOR["mean"]).init(jax.random.key(0), wrong, own)
+
+
+class LastMessage(nn.Module):
+    """Linen module without the base class: the message in the last slot, present or not."""
+
+    num_parts = 1
+    num_encoders = 1
+
+    def __call__(self, messages, segments):
+        return sets.aggregate(self, messages, segments)
+
+    def pool(self, view):
+        return view.messages[:, -1]
+
+
+class Largest(nn.Module):
+    """Linen module without the base class: the maximum."""
+
+    num_parts = 1
+    num_encoders = 1
+    reduction = "max"
+    lift = AGGREGATORS["max"].lift
+    lower = AGGREGATORS["max"].lower
+
+    __call__ = sets.aggregate
+
+
+def test_any_linen_module_with_the_methods_is_an_aggregator():
+    messages = jnp.arange(12.0).reshape(6, 2)
+    np.testing.assert_array_equal(LastMessage().apply({}, messages, SEGMENTS), messages[1::2])
+    np.testing.assert_array_equal(Largest().apply({}, messages, SEGMENTS), messages[1::2])
+    for model in (LastMessage(), Largest()):
+        assert jax.eval_shape(lambda m=model: Groups(m).init_with_output(jax.random.key(0), *groups(0)))[0].shape == (
+            5,
+            4,
+        )
+
+
+def test_a_module_that_is_no_aggregator_is_named():
+    with pytest.raises(ValueError, match=r"aggregator: must be a module with .*, got Dense"):
+        sets.aggregate(nn.Dense(2), MESSAGES, SEGMENTS)

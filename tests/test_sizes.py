@@ -1,4 +1,4 @@
-"""One policy for any number of agents, and swarms of ten thousand."""
+"""Tests of policies with changing numbers of agents, and of swarms of ten thousand agents."""
 
 from functools import partial
 
@@ -12,8 +12,8 @@ from jaxswarm import LEARNERS, TASKS, ActorCritic, Experiment, rollout
 
 @pytest.mark.slow
 def test_ten_thousand_agents_step_and_act_in_little_memory():
-    """Of the compiled program, without running it. One matrix of all pairs would be 400 MB."""
-    radius = 100 * (30 / jnp.pi / 10_000) ** 0.5  # about 30 are seen
+    """The compiled program reports its memory without running. One matrix of all pairs would need 400 MB."""
+    radius = 100 * (30 / jnp.pi / 10_000) ** 0.5  # about 30 neighbors are visible
     for name in ("rendezvous", "pursuit"):
         task = TASKS[name](num_agents=10_000, visibility_radius=float(radius), max_neighbors=48)
         network = ActorCritic()
@@ -39,11 +39,11 @@ def test_a_policy_trained_with_10_agents_gathers_40():
         policy = partial(network.apply, params, method="policy")
         return rollout.evaluate(jax.random.key(1), TASKS["rendezvous"](num_agents=40), policy, 10)["return"]
 
-    before = score(state.learner.params)
+    untrained = score(state.learner.params)
     state, _ = jaxswarm.train(experiment, state, 40)
-    after = score(state.learner.params)
-    assert before < -300
-    assert after > -60
+    trained = score(state.learner.params)
+    assert untrained < -300
+    assert trained > -60
 
 
 @pytest.mark.slow
@@ -59,4 +59,4 @@ def test_swarms_with_limited_sight_and_of_changing_size_learn(name, fields):
     experiment = Experiment(TASKS[name](**fields), ActorCritic(), LEARNERS["ppo"]())
     _, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 31)
     untrained, *_, trained = metrics["eval/return"][::10]
-    assert trained > 0.7 * untrained  # of the distance that makes up the loss, a third is gone at least
+    assert trained > 0.7 * untrained  # returns are negative distances: training removes at least 30 %

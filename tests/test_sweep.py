@@ -1,4 +1,4 @@
-"""Sweeps and searches of tiny experiments, through the program that users call."""
+"""Sweeps and searches of tiny experiments, mostly through the command line program."""
 
 import csv
 import dataclasses
@@ -26,7 +26,7 @@ SWEPT = [*OVERRIDES, "learner.learning_rate=1e-4..1e-2:3log", "network.activatio
 
 
 def shortened(runs, num_updates):
-    """The runs as if they had been interrupted after so many updates."""
+    """Return the runs as if they had been interrupted after `num_updates` updates."""
     return [
         dataclasses.replace(run, settings=dataclasses.replace(run.settings, num_updates=num_updates)) for run in runs
     ]
@@ -98,7 +98,7 @@ def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, 
         assert {path.name for path in folder.glob("replay-*.html")} == {"replay-0.html", "replay-3.html"}
     before = {path: path.read_bytes() for path in folders[1].rglob("*") if path.is_file()}
     shutil.rmtree(folders[0])
-    assert program.main([f"resume={sweep_dir}"]) == 0  # trains what is missing, and leaves what is beside it
+    assert program.main([f"resume={sweep_dir}"]) == 0  # trains the missing run and leaves the others unchanged
     assert len(files.read_rows(folders[0] / "metrics.csv")) == 6
     assert {path: path.read_bytes() for path in folders[1].rglob("*") if path.is_file()} == before
     alone = config.load(folders[3] / "config.yaml")
@@ -115,7 +115,7 @@ def test_a_seed_that_diverges_counts_with_its_worst():
     rows += [{"update": 0, "seed": 1, "eval/return": -6.0}]
     assert search.value(rows, [0, 1], 3) == 2
     assert search.value(rows, [0, 1, 2], 3) == (10 - 6 - 6) / 3
-    assert search.value(rows[-2:], [0, 1], 3) == (20 * 3 - 6 * 3) / 6  # all have diverged
+    assert search.value(rows[-2:], [0, 1], 3) == (20 * 3 - 6 * 3) / 6  # all seeds have diverged
     assert math.isnan(search.value([], [0], 3))
 
 
@@ -240,7 +240,7 @@ def test_a_search_shares_its_storage_and_continues_what_was_cut_off(tmp_path, mo
         patch.setattr(execution, "fit_runs", lambda runs, **options: real(shortened(runs, 2), **options))
         assert program.main([*overrides, f"sweep_dir={tmp_path / 'one'}"]) == 0
     assert "stopped; resume with" in capsys.readouterr().out
-    assert program.main([*overrides, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine takes it over
+    assert program.main([*overrides, f"sweep_dir={tmp_path / 'two'}"]) == 0  # another machine resumes it
     study = search.open_study(str(storage))
     complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
     assert len(complete) == 3

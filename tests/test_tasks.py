@@ -1,4 +1,4 @@
-"""What every task promises."""
+"""Tests of the contract that every registered task fulfills."""
 
 import dataclasses
 
@@ -10,10 +10,10 @@ import pytest
 from jaxswarm.tasks import TASKS
 from jaxswarm.types import Observation
 
-NUM_AGENTS, EPISODE_LENGTH, NUM_WORLDS = 4, 6, 3
+NUM_AGENTS, EPISODE_LENGTH, NUM_ENVS = 4, 6, 3
 KEY = jax.random.key(1)
 VARIANTS = {
-    "as they are": {},
+    "defaults": {},
     "numbers vary, nearest only": {"active_agents": (2, 3), "max_neighbors": 2, "visibility_radius": 60.0},
     "boxes vary": {"active_boxes": (1, 3)},
 }
@@ -24,8 +24,8 @@ def has_fields(cls, fields):
 
 
 def case(name, variant):
-    is_solved = has_fields(TASKS[name], {"physics": None})  # steps of rigid bodies take long to compile
-    return pytest.param((name, variant), marks=[pytest.mark.slow] if is_solved else [], id=f"{name} {variant}")
+    is_slow = has_fields(TASKS[name], {"physics": None})  # rigid-body steps take long to compile
+    return pytest.param((name, variant), marks=[pytest.mark.slow] if is_slow else [], id=f"{name} {variant}")
 
 
 @pytest.fixture(params=[case(name, x) for name in TASKS for x in VARIANTS if has_fields(TASKS[name], VARIANTS[x])])
@@ -53,7 +53,7 @@ def random_actions(task, *axes):
     return jax.random.uniform(KEY, (*axes, task.num_agents, task.action_dim), minval=-1)
 
 
-def describe(tree):
+def shapes_and_types(tree):
     return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
 
 
@@ -71,35 +71,35 @@ def number_fields(task):
 
 def test_states_keep_their_shapes_and_types(task):
     state = reset(task, KEY)
-    after, _ = step(task, KEY, state, random_actions(task))
-    assert describe(after) == describe(state)
+    next_state, _ = step(task, KEY, state, random_actions(task))
+    assert shapes_and_types(next_state) == shapes_and_types(state)
     assert state.time == 0
-    assert after.time == 1
+    assert next_state.time == 1
 
 
 def test_in_double_precision_states_keep_their_types_too(task):
     with jax.enable_x64(True):
-        start, (after, outcome), obs = jax.eval_shape(
+        start, (next_state, outcome), obs = jax.eval_shape(
             lambda key, action: (state := task.reset(key), task.step(key, state, action), task.observe(state)),
             KEY,
             jax.ShapeDtypeStruct((NUM_AGENTS, task.action_dim), jnp.float64),
         )
-    assert describe(after) == describe(start)
+    assert shapes_and_types(next_state) == shapes_and_types(start)
     assert start.position.dtype == outcome.reward.dtype == obs.own.dtype == jnp.float64
 
 
 @pytest.mark.slow
 def test_steps_outside_of_any_program_compile_once(task):
-    """But the grid of cells: it is for swarms that nobody steps like this."""
+    """The grid of cells is an exception: it serves large swarms, whose steps are always compiled."""
     if getattr(task, "max_neighbors", None):
-        pytest.skip("lists of the nearest compile at every step outside of a program")
+        pytest.skip("lists of nearest neighbors compile at every step outside of a compiled function")
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, seconds, **_: compiled.append(event) if "backend_compile" in event else None
     )
     state, action = task.reset(KEY), jnp.zeros((NUM_AGENTS, task.action_dim))
     jax.jit(lambda x: x + len(compiled))(1)
-    assert compiled  # the listener hears of programs
+    assert compiled  # the listener receives compile events
     state, _ = task.step(KEY, state, action)
     compiled.clear()
     task.step(KEY, state, action)
@@ -108,8 +108,8 @@ def test_steps_outside_of_any_program_compile_once(task):
 
 def test_steps_are_scalars(task):
     _, outcome = step(task, KEY, reset(task, KEY), random_actions(task))
-    assert describe(outcome.reward) == ((), jnp.float32)
-    assert describe(outcome.terminated) == describe(outcome.truncated) == ((), jnp.bool)
+    assert shapes_and_types(outcome.reward) == ((), jnp.float32)
+    assert shapes_and_types(outcome.terminated) == shapes_and_types(outcome.truncated) == ((), jnp.bool)
     assert outcome.metrics
     assert all(metric.shape == () for metric in outcome.metrics.values())
 
@@ -138,7 +138,7 @@ def test_any_number_of_agents_gives_features_of_the_same_size(task, num_agents):
 
 
 def test_everything_stays_finite(task):
-    """But metrics, which are NaN where they say nothing."""
+    """Metrics are an exception: they are NaN at steps without a value."""
     state, actions = reset(task, KEY), random_actions(task, 50)
     for action in actions:
         state, outcome = step(task, KEY, state, action)
@@ -165,7 +165,7 @@ def test_one_agent_perceives_what_all_observe(task):
 def test_views_grow_no_faster_than_the_number_of_agents(task):
     few, many = (jax.eval_shape(lambda t: t.view(t.reset(KEY)), task.replace(num_agents=n)) for n in (5, 10))
     for small, large in zip(jax.tree.leaves(few), jax.tree.leaves(many), strict=True):
-        assert large.size in (small.size, 2 * small.size)  # of other entities, or of agents
+        assert large.size in (small.size, 2 * small.size)  # leaves of other entities, or of agents
 
 
 def test_observations_are_functions_of_the_state(task):
@@ -173,22 +173,22 @@ def test_observations_are_functions_of_the_state(task):
     assert_equal(observe(task, state), observe(task, state.replace(time=state.time + 3)))
 
 
-def test_worlds_are_batched_by_vmap(task):
-    keys = jax.random.split(KEY, NUM_WORLDS)
-    actions = random_actions(task, NUM_WORLDS)
+def test_environments_are_batched_by_vmap(task):
+    keys = jax.random.split(KEY, NUM_ENVS)
+    actions = random_actions(task, NUM_ENVS)
     starts = jax.vmap(reset, (None, 0))(task, keys)
     states, steps = jax.vmap(step, (None, 0, 0, 0))(task, keys, starts, actions)
     all_obs = jax.vmap(observe, (None, 0))(task, states)
-    for world in range(NUM_WORLDS):
-        state, outcome = step(task, keys[world], reset(task, keys[world]), actions[world])
+    for env in range(NUM_ENVS):
+        state, outcome = step(task, keys[env], reset(task, keys[env]), actions[env])
         expected = state, outcome, observe(task, state)
-        assert_close(jax.tree.map(lambda leaf, i=world: leaf[i], (states, steps, all_obs)), expected, atol=1e-5)
+        assert_close(jax.tree.map(lambda leaf, i=env: leaf[i], (states, steps, all_obs)), expected, atol=1e-5)
 
 
 @pytest.mark.slow
 def test_compiled_steps_are_those_of_plain_python(task):
     if hasattr(task, "physics"):
-        pytest.skip("a step of rigid bodies is a minute of single operations; test_rigid2d has closed forms and Box2D")
+        pytest.skip("a rigid-body step takes a minute without jit; test_rigid2d compares it to closed forms and Box2D")
     start, action = reset(task, KEY), random_actions(task)
     with jax.disable_jit():
         plain = task.step(KEY, start, action)
@@ -221,12 +221,12 @@ def test_trees_of_tasks_can_be_rebuilt(task):
 
 @jax.jit
 def slope(task, position, offset):
-    """Gradient of all that is seen and rewarded, in a world with agents at `position + offset`, and one step later."""
+    """Return the gradient of all observations and rewards with agents at `position + offset`, and one step later."""
 
     def total(offset):
         start = task.reset(KEY).replace(position=position + offset)
-        after, outcome = task.step(KEY, start, random_actions(task))
-        floats = (task.observe(start), task.observe(after), outcome.reward)
+        next_state, outcome = task.step(KEY, start, random_actions(task))
+        floats = (task.observe(start), task.observe(next_state), outcome.reward)
         return sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(floats))
 
     return jax.grad(total)(offset)

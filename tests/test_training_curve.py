@@ -1,4 +1,4 @@
-"""`curve.png` shows a run of one seed or of several."""
+"""The learning curve `curve.png` shows runs of one seed and of several seeds."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Losses against recorded ones, entropy control, and bad input."""
+"""TRL reproduces recorded losses, controls the entropy and refuses bad input."""
 
 from functools import partial
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import NETWORK, OPTIONS, PROBES, SIZES, look
+from probes import NETWORK, OPTIONS, PROBES, SIZES, policy_and_value
 from test_projections import META, NUM_ROWS, arrays, cov_distance, mean_distance, recorded_inputs
 
 import jaxswarm
@@ -22,7 +22,7 @@ NO_TARGET = jnp.zeros(())
 
 
 class Outputs:
-    """In place of a network: what it would put out are the parameters."""
+    """Network whose outputs are its parameters."""
 
     def __init__(self, std):
         self.std = std
@@ -33,11 +33,11 @@ class Outputs:
 
 
 @partial(jax.jit, static_argnums=1)
-def loss_and_gradient(learner, std, params, batch, least_entropy=NO_TARGET):
-    """With the advantages as they are, as the recorded losses do not standardize them."""
+def loss_and_gradient(learner, std, params, batch, entropy_bound=NO_TARGET):
+    """Return loss, metrics and gradient without standardized advantages, as in the recorded losses."""
 
     def loss(params):
-        return learner.loss(Outputs(std), params, batch, least_entropy)
+        return learner.loss(Outputs(std), params, batch, entropy_bound)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(on_policy, "standardized", lambda advantage, mask: advantage)
@@ -46,7 +46,7 @@ def loss_and_gradient(learner, std, params, batch, least_entropy=NO_TARGET):
 
 
 def recorded_batch(meta):
-    """Outputs of a network, and a batch for it, in a program for all dimensions."""
+    """Return the outputs of a network and a batch for it, padded to shapes that suit all dimensions."""
     recorded = arrays(meta)
     (mean, std, old_mean, old_std, mean_bound, cov_bound), _ = recorded_inputs(meta, recorded, jnp.float32)
     action = jnp.pad(jnp.asarray(recorded["act"]), ((0, 0), (0, mean.shape[1] - meta["dim"])))
@@ -87,10 +87,10 @@ def test_recorded_surrogate(meta):
 @by_case
 def test_recorded_regression_loss(meta):
     recorded, metrics, gradient = recorded_losses(meta, meta["coefficient"])
-    if meta["projection"] != "frobenius":  # there gradients flow into the recorded goal
+    if meta["projection"] != "frobenius":  # whose recorded gradients also flow into the goal
         assert relative_error(gradient["mean"], recorded["g_surr_mean"] + recorded["g_tr_mean"]) < 1e-4
         assert relative_error(gradient["std"], recorded["g_surr_std"] + recorded["g_tr_std"]) < 1e-3
-    elif not meta["is_shared"]:  # there the recorded loss has the standard deviation in place of the variance
+    elif not meta["is_shared"]:  # the recorded loss uses the standard deviation instead of the variance
         std, goal = recorded["std"], recorded["proj_std"]
         other = np.square(std - goal).sum(-1) - np.square(std**2 - goal**2).sum(-1)
         recorded["tr_loss"] = recorded["tr_loss"] - meta["coefficient"] * other.mean()
@@ -158,7 +158,7 @@ def test_a_standard_deviation_that_depends_on_the_state_is_learned(name):
     experiment = Experiment(task, NETWORK.clone(std="state"), learner, **SIZES)
     _, metrics = jaxswarm.train(experiment, jaxswarm.init(experiment, jax.random.key(0)), 41)
     returns = metrics["eval/return"][::20]
-    assert returns[2] > returns[0] / 2  # both are negative
+    assert returns[2] > returns[0] / 2  # both returns are negative
     assert metrics["learner/entropy"][-1] < metrics["learner/entropy"][0]
 
 
@@ -167,10 +167,10 @@ def test_the_entropy_of_the_policy_follows_its_schedule():
     options = {"entropy_control": "equality", "target_entropy": 0.5, "entropy_updates": 4.0}
     experiment = Experiment(PROBES["constant reward"], NETWORK, TRL(**OPTIONS, **options), **SIZES)
     state = jaxswarm.init(experiment, jax.random.key(0))
-    initial = 0.5 * np.log(2 * np.pi * np.e)  # of a standard deviation of 1
+    initial = 0.5 * np.log(2 * np.pi * np.e)  # entropy of a standard deviation of 1
     for progress in (0.25, 0.5, 0.75, 1.0, 1.0):
         state, _ = jaxswarm.train(experiment, state, 1)
-        policy, _ = look(state.learner.params, 1, 0)
+        policy, _ = policy_and_value(state.learner.params, 1, 0)
         assert float(policy.entropy()) == pytest.approx(initial + progress * (0.5 - initial), abs=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Policies before any training score what those of the thesis did, which needs all of task and evaluation right."""
+"""Tests that untrained policies score as in the thesis, which requires correct tasks, networks and evaluation."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ from jaxswarm import TASKS, ActorCritic, rollout
     ids=["rendezvous", "one evader", "five evaders"],
 )
 def test_untrained_policies_score_what_those_of_the_thesis_did(name, fields, score, num_policies):
-    """Means of 117, 155 and 815 runs there. The spread between policies tells how far off the mean of ours may be."""
+    """Expected scores are means of 117, 155 and 815 runs of the thesis; the tolerance is 3 standard errors of ours."""
     task, network = TASKS[name](**fields), ActorCritic()
 
     @jax.jit

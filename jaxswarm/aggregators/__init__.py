@@ -1,23 +1,23 @@
-"""Aggregators: the messages of a group of any size, in any order, become one vector of fixed size.
+"""Aggregators that map the messages of a group of any size, in any order, to one vector of fixed size.
 
-An aggregator is a linen module that is called with a list of messages and their `Segments`, and gives the vector of
-each receiver. Most are commutative monoids (see `sets`), which is why they can also be computed without ever holding
-all messages at once; `Attentive` and `Concat` need the whole group and have `pool` instead.
+An aggregator is a linen module that is called with a list of messages and their `Segments`, and returns the vector of
+each receiver. Most are commutative monoids (see `sets`), so they can be computed without holding all messages in memory
+at once. `Attentive` and `Concat` need the whole group and have `pool` instead.
 
-Each tells by `weights` which share each entity has in the vector of its group, for those who look at a trained policy:
-shares of present entities sum to 1, absent ones have exactly 0.
+To inspect a trained policy, `weights` returns the share of each entity in the vector of its group. The shares of
+present entities sum to 1; absent entities have exactly 0.
 
-A message has `num_parts` parts of equal length. `num_encoders` says what makes them: one encoder all parts, as many
-encoders one part each, or, if 0, the message is the features of an entity as they are.
+A message has `num_parts` parts of equal length. With `num_encoders=1` one encoder computes all parts; with as many
+encoders as parts each computes one part; with `num_encoders=0` the message is the features of an entity, not encoded.
 """
 
-from typing import Any
+from flax import linen as nn
 
 from jaxswarm.aggregators.attentive import Attentive
 from jaxswarm.aggregators.features import Concat, Histogram, RadialBasis
 from jaxswarm.aggregators.monoids import Bayesian, Max, Mean, Softmax
 
-AGGREGATORS: dict[str, Any] = {
+AGGREGATORS: dict[str, type[nn.Module]] = {
     "mean": Mean,
     "max": Max,
     "softmax": Softmax,

@@ -1,4 +1,4 @@
-"""Aggregators of what is known of each entity as it is, without an encoder."""
+"""Aggregators of the features of entities, without an encoder: concatenation, histogram and radial basis functions."""
 
 import math
 from collections.abc import Callable
@@ -7,21 +7,24 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import linen as nn
 from jaxtyping import Array, Float, Int, Shaped
 
 from jaxswarm import checks
 from jaxswarm.aggregators import sets
 from jaxswarm.aggregators.monoids import Mean
-from jaxswarm.aggregators.sets import DenseView
+from jaxswarm.aggregators.sets import Aggregator, DenseView
 from jaxswarm.checks import require
 
 
-class Concat(nn.Module):
-    """The features of the nearest entities one after the other, the nearest first, zeros where there are fewer.
+class Concat(Aggregator):
+    """Concatenation of the features of the nearest entities, the nearest first, padded with zeros.
 
-    The baseline without an aggregate: its size grows with the group. The first feature is the distance; of equally
-    distant entities the later features decide.
+    This is the baseline without an aggregate, whose size grows with the group. The first feature must be the distance;
+    the later features break ties.
+
+    Attributes:
+        max_entities: The vector holds the features of at most this many entities (an integer >= 1), and entities
+            farther away are ignored.
     """
 
     max_entities: int = 10
@@ -33,30 +36,34 @@ class Concat(nn.Module):
         require(self, checks.integer(1), "max_entities")
         super().__post_init__()
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def pool(self, view: DenseView) -> Float[Array, "receivers all_features"]:
-        """Sorts by distance, absent entities last."""
+        """Return the features sorted by distance, absent entities last."""
         order = self._order(view)[..., None]
         nearest = jnp.take_along_axis(jnp.where(view.mask[..., None], view.messages, 0.0), order, axis=1)
         nearest = jnp.pad(nearest, ((0, 0), (0, self.max_entities - nearest.shape[1]), (0, 0)))
         return nearest.reshape(nearest.shape[0], self.max_entities * nearest.shape[2])
 
     def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
-        """Equal for those that there is room for, 0 for the others."""
-        is_taken = jax.nn.one_hot(self._order(view), view.mask.shape[1], dtype=bool).any(1)
-        return sets.shares((is_taken & view.mask)[..., None], view.mask)
+        """Return equal shares for the nearest `max_entities` entities and 0 for the others."""
+        is_nearest = jax.nn.one_hot(self._order(view), view.mask.shape[1], dtype=bool).any(1)
+        return sets.normalized_weights((is_nearest & view.mask)[..., None], view.mask)
 
     def _order(self, view: DenseView) -> Int[Array, "receivers nearest"]:
         keys = jnp.where(view.mask[..., None], jax.lax.stop_gradient(view.messages), jnp.inf)
         return jnp.lexsort(jnp.moveaxis(keys, -1, 0)[::-1])[:, : self.max_entities]
 
 
-class Histogram(nn.Module):
+class Histogram(Aggregator):
     """Fractions of the entities in bins of distance and bearing (Hüttenrauch et al., 2019).
 
-    The first feature is the distance, the next two are [cos, sin] (or [sin, cos]) of the bearing. Entities beyond
-    `max_distance` (in the unit of the feature) count in the outermost bins. The vector of an empty group is 0.
+    The first feature must be the distance, the next two [cos, sin] (or [sin, cos]) of the bearing. The vector of an
+    empty group is 0.
+
+    Attributes:
+        num_distances: The distances from 0 to `max_distance` are divided into this many equal bins (an integer >= 1).
+        num_bearings: The circle of bearings is divided into this many equal bins (an integer >= 3).
+        max_distance: The last bin of distance ends at this value (> 0, in the unit of the feature) and also counts all
+            entities beyond it.
     """
 
     num_distances: int = 8
@@ -73,32 +80,38 @@ class Histogram(nn.Module):
         require(self, checks.POSITIVE, "max_distance")
         super().__post_init__()
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def lift(self, features: Float[Array, "n dim"]) -> tuple[Array, Array]:
-        """One-hot bin and count."""
+        """Return the one-hot bin and the count 1."""
         distance, bearing = _distance_and_bearing(features)
         inner_edges = np.arange(1, self.num_distances) * self.max_distance / self.num_distances
         beyond = distance >= jnp.asarray(inner_edges, jnp.float32)[None]
         ones = jnp.ones((features.shape[0], 1), bool)
         in_ring = jnp.concatenate([ones, beyond], 1) & ~jnp.concatenate([beyond, ~ones], 1)
         edge = jnp.asarray(_directions(self.num_bearings))
-        is_left = bearing[:, 1:] * edge[None, 0] >= bearing[:, :1] * edge[None, 1]  # of an edge between sectors
-        in_sector = is_left & ~jnp.roll(is_left, -1, axis=1)
+        is_left_of_edge = bearing[:, 1:] * edge[None, 0] >= bearing[:, :1] * edge[None, 1]
+        in_sector = is_left_of_edge & ~jnp.roll(is_left_of_edge, -1, axis=1)
         return _outer(in_ring, in_sector, jnp.logical_and).astype(jnp.float32), ones.astype(jnp.float32)
 
     lower = Mean.lower
     weights = Mean.weights
 
 
-class RadialBasis(nn.Module):
+class RadialBasis(Aggregator):
     """Mean of radial basis functions on a grid over distance and bearing (Hüttenrauch et al., 2019).
 
         phi_kl = exp(-(d - d_k)^2 / (2 u^2)) exp((cos(b - b_l) - 1) / v^2)
 
-    The first feature is the distance d, the next two are [cos, sin] (or [sin, cos]) of the bearing b. The d_k are
-    evenly spaced from 0 to `max_distance` (in the unit of the feature), the b_l on the circle; near b_l the second
-    factor is a Gaussian of width v. Widths are in units of the spacing. The vector of an empty group is 0.
+    The first feature must be the distance d, the next two [cos, sin] (or [sin, cos]) of the bearing b. The widths are
+    u = `distance_width` spacings of the centers d_k, and v = `bearing_width` spacings of the centers b_l. Near b_l, the
+    second factor is a Gaussian of width v. The vector of an empty group is 0.
+
+    Attributes:
+        num_distances: This many centers (an integer >= 2) are evenly spaced from distance 0 to `max_distance`.
+        num_bearings: This many centers (an integer >= 2) are evenly spaced on the circle of bearings.
+        max_distance: The last center of distance lies at this value (> 0, in the unit of the feature).
+        distance_width: The functions of distance have this standard deviation (> 0, in spacings between the centers).
+        bearing_width: The functions of bearing have this standard deviation near their centers (> 0, in spacings
+            between the centers).
     """
 
     num_distances: int = 8
@@ -116,37 +129,38 @@ class RadialBasis(nn.Module):
         require(self, checks.POSITIVE, "max_distance", "distance_width", "bearing_width")
         super().__post_init__()
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def lift(self, features: Float[Array, "n dim"]) -> tuple[Array, Array]:
-        """Values of all basis functions, and count."""
+        """Return the values of all basis functions and the count 1."""
         d, b = _distance_and_bearing(features)
         spacing = self.max_distance / (self.num_distances - 1)
         centers = jnp.linspace(0.0, self.max_distance, self.num_distances)
         near = jnp.exp(-0.5 * jnp.square((d - centers[None]) / (self.distance_width * spacing)))
         v = self.bearing_width * 2 * math.pi / self.num_bearings
-        ahead = jnp.exp((b @ jnp.asarray(_directions(self.num_bearings)) - 1.0) / v**2)
-        return _outer(near, ahead, jnp.multiply), jnp.ones((features.shape[0], 1))
+        in_direction = jnp.exp((b @ jnp.asarray(_directions(self.num_bearings)) - 1.0) / v**2)
+        return _outer(near, in_direction, jnp.multiply), jnp.ones((features.shape[0], 1))
 
     lower = Mean.lower
     weights = Mean.weights
 
 
 def _distance_and_bearing(features: Float[Array, "n dim"]) -> tuple[Float[Array, "n 1"], Float[Array, "n 2"]]:
-    """An entity at distance 0, whose bearing may be given as [0, 0], is ahead."""
+    """Return the first feature and the next two; a bearing of [0, 0], as at distance 0, becomes [1, 0].
+
+    Raises a `ValueError` if there are fewer than three features.
+    """
     if features.shape[1] < 3:
         raise ValueError(f"features: must start with distance, cos and sin, got {features.shape[1]} features")
     distance, bearing = features[:, :1], features[:, 1:3]
-    is_ahead = (bearing == 0).all(-1, keepdims=True)
-    return distance, jnp.where(is_ahead, jnp.array([[1.0, 0.0]]), bearing)
+    is_undefined = (bearing == 0).all(-1, keepdims=True)
+    return distance, jnp.where(is_undefined, jnp.array([[1.0, 0.0]]), bearing)
 
 
 def _outer(a: Shaped[Array, "n i"], b: Shaped[Array, "n j"], product: Callable) -> Shaped[Array, "n i_times_j"]:
-    """All products of a feature of each."""
+    """Return the products of all pairs of a feature of `a` and a feature of `b`."""
     return product(a[:, :, None], b[:, None]).reshape(a.shape[0], a.shape[1] * b.shape[1])
 
 
 def _directions(number: int) -> np.ndarray:
-    """Unit vectors [2, number], evenly spaced on the circle, the first along x."""
+    """Return unit vectors [2, number], evenly spaced on the circle, the first along x."""
     angle = 2 * math.pi * np.arange(number) / number
     return np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32)

@@ -12,16 +12,19 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from jaxswarm import checks
 from jaxswarm.aggregators import sets
-from jaxswarm.aggregators.sets import DenseView
+from jaxswarm.aggregators.sets import Aggregator, DenseView
 from jaxswarm.checks import require
 
-# log(1 + t) / t on [0, 1], to 2e-7; `jnp.log1p` takes several times as long on CPU
+# Coefficients of log(1 + t) / t on [0, 1], exact to 2e-7; `jnp.log1p` takes several times as long on a CPU.
 _LOG1P = Chebyshev.interpolate(lambda t: np.log1p(t) / t, 9, [0, 1]).convert(kind=Polynomial).coef
 
 
 @jax.custom_jvp
 def softplus_precision(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """1 / log(1 + exp(x)), to 1e-6; with its derivative many times faster on CPU than by way of `jax.nn.softplus`."""
+    """Return 1 / log(1 + exp(x)), exact to 1e-6.
+
+    Together with its derivative it is many times faster on a CPU than `1 / jax.nn.softplus(x)`.
+    """
     decay = jnp.exp(-jnp.abs(x))
     ratio = functools.reduce(lambda total, c: total * decay + c, _LOG1P[::-1].tolist())
     return 1.0 / (jnp.maximum(x, 0.0) + decay * ratio)
@@ -31,106 +34,110 @@ def softplus_precision(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def _softplus_precision_jvp(primals: tuple, tangents: tuple) -> tuple:
     (x,), (dx,) = primals, tangents
     precision = softplus_precision(x)
-    decay = jnp.exp(-jnp.abs(x))  # shared with the line above once compiled
+    decay = jnp.exp(-jnp.abs(x))  # XLA shares it with the call above
     sigmoid = jnp.where(x > 0, 1.0, decay) / (1.0 + decay)
     return precision, -precision * (precision * sigmoid) * dx
 
 
 def _bounded(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Above where sums of precisions, and their products with messages, would overflow."""
+    """Clip x to >= -60, so that sums of precisions and their products with messages do not overflow."""
     return jnp.maximum(x, -60.0)
 
 
-PRECISION = {  # of what a rectifier makes of a number
+PRECISION = {  # 1 / s of the variance s that the rectifier makes of a number
     "softplus": lambda x: softplus_precision(_bounded(x)),
     "exp": lambda x: jnp.exp(-_bounded(x)),
 }
 
 
-class Mean(nn.Module):
-    """Arithmetic mean; the vector of an empty group is 0."""
+class Mean(Aggregator):
+    """Arithmetic mean of the messages; the vector of an empty group is 0."""
 
     num_parts: ClassVar[int] = 1
     num_encoders: ClassVar[int] = 1
     reduction: ClassVar[str] = "add"
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def lift(self, message: Float[Array, "n features"]) -> tuple[Array, Array]:
-        """Message and count."""
+        """Return the message and the count 1."""
         return message, jnp.ones((message.shape[0], 1))
 
     def lower(self, summary: tuple[Array, Array]) -> Float[Array, "receivers features"]:
-        """Sum over count."""
+        """Return the sum over the count."""
         total, count = summary
         return total / jnp.maximum(count, 1.0)
 
     def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
-        """1 / n each."""
-        return sets.shares(view.mask[..., None], view.mask)
+        """Return 1 / n for each of n entities."""
+        return sets.normalized_weights(view.mask[..., None], view.mask)
 
 
-class Max(nn.Module):
+class Max(Aggregator):
     """Largest value of each feature; the vector of an empty group is 0."""
 
     num_parts: ClassVar[int] = 1
     num_encoders: ClassVar[int] = 1
     reduction: ClassVar[str] = "max"
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def lift(self, message: Float[Array, "n features"]) -> Array:
-        """The message."""
+        """Return the message, which is its own summary."""
         return message
 
     def lower(self, summary: Array) -> Float[Array, "receivers features"]:
-        """The maximum, if there is one."""
+        """Return the maximum, and 0 for empty groups."""
         return jnp.where(summary > sets.LOWEST, summary, 0.0)
 
     def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
-        """Share of the features in which an entity has the largest value; those that are equal share one."""
+        """Return the share of features in which an entity has the largest value; equal entities share a feature."""
         x = jnp.where(view.mask[..., None], view.messages, sets.LOWEST)
-        return sets.shares(x == x.max(1, keepdims=True, initial=sets.LOWEST), view.mask)
+        return sets.normalized_weights(x == x.max(1, keepdims=True, initial=sets.LOWEST), view.mask)
 
 
-class Softmax(nn.Module):
-    """Mean of each feature, weighted by its own exponential; the vector of an empty group is 0.
+class Softmax(Aggregator):
+    """Mean of each feature, weighted by the exponential of the feature.
 
-    z = sum_n x_n exp(x_n) / sum_n exp(x_n)
+        z = sum_n x_n exp(x_n) / sum_n exp(x_n)
+
+    The vector of an empty group is 0.
     """
 
     num_parts: ClassVar[int] = 1
     num_encoders: ClassVar[int] = 1
     reduction: ClassVar[str] = "scaled_add"
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def lift(self, message: Float[Array, "n features"]) -> tuple[Array, tuple[Array, Array]]:
-        """Numerator x exp(x) and denominator exp(x), both in units of exp(x)."""
+        """Return the numerator x exp(x) and the denominator exp(x), both in units of exp(x)."""
         return message, (message, jnp.ones_like(message))
 
     def lower(self, summary: tuple[Array, tuple[Array, Array]]) -> Float[Array, "receivers features"]:
-        """Numerator over denominator."""
+        """Return the numerator over the denominator."""
         _, (weighted, weight) = summary
         return weighted / jnp.where(weight > 0, weight, 1.0)
 
     def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
-        """exp(x_n) / sum_n exp(x_n), mean over the features."""
+        """Return exp(x_n) / sum_n exp(x_n), mean over the features."""
         x = jnp.where(view.mask[..., None], view.messages, sets.LOWEST)
-        return sets.shares(jnp.exp(x - x.max(1, keepdims=True, initial=sets.LOWEST)), view.mask)
+        return sets.normalized_weights(jnp.exp(x - x.max(1, keepdims=True, initial=sets.LOWEST)), view.mask)
 
 
-class Bayesian(nn.Module):
+class Bayesian(Aggregator):
     """Gaussian conditioning of a latent vector z on one observation per entity (Volpp et al., 2021, eq. 8).
 
         1 / s_z = 1 / s_0 + sum_n 1 / s_n
         mu_z = mu_0 + s_z sum_n (r_n - mu_0) / s_n
 
-    A message has two parts: the observations r_n and what the rectifier turns into their variances s_n; one encoder
-    makes both, or each has its own. The prior mean mu_0 and the (rectified) prior variance s_0 are learned per feature
-    or as one scalar, fixed to where these begin (1, and the rectified 1), or absent (0 and infinity). The vector of an
-    empty group is the prior mean, or 0 where there is no prior variance. With `output_variance` the vector is
-    [mu_z, s_z]; an empty group without prior then has variance 0.
+    A message has two parts: the observations r_n, and numbers that the rectifier turns into their variances s_n. The
+    prior has mean mu_0 and variance s_0. The vector is mu_z, or [mu_z, s_z] with `output_variance`. The vector of an
+    empty group is the prior mean, or 0 if the prior variance is infinite; then s_z is 0, too.
+
+    Attributes:
+        prior_mean: The prior mean is learned per feature (`feature`) or as one scalar (`scalar`), both starting at 1,
+            or it is fixed to 1 (`fixed`) or to 0 (null).
+        prior_variance: The prior variance is learned per feature (`feature`) or as one scalar (`scalar`), both starting
+            at the rectified 1, or it is fixed to the rectified 1 (`fixed`) or infinite (null).
+        rectifier: The rectifier makes variances positive by log(1 + exp(x)) (`softplus`) or by exp(x) (`exp`).
+        variance_encoder: One encoder computes observations and variances (`shared`), or each has its own encoder
+            (`separate`).
+        output_variance: The vector also contains the variance of the posterior if true, which doubles its length.
     """
 
     prior_mean: Literal["feature", "scalar", "fixed"] | None = "feature"
@@ -139,7 +146,7 @@ class Bayesian(nn.Module):
     variance_encoder: Literal["shared", "separate"] = "shared"
     output_variance: bool = False
 
-    __no_type_check__ = True  # checked below, with a message for users
+    __no_type_check__ = True  # `__post_init__` checks the fields, with a message for users
 
     num_parts: ClassVar[int] = 2
     reduction: ClassVar[str] = "add"
@@ -154,19 +161,17 @@ class Bayesian(nn.Module):
 
     @property
     def num_encoders(self) -> int:
-        """One encoder makes both parts of a message, or each has its own."""
+        """Number of encoders: 1 for both parts of a message, or 2, one for each part."""
         return 1 if self.variance_encoder == "shared" else 2
 
-    __call__ = sets.aggregate  # pyright: ignore[reportAssignmentType]
-
     def lift(self, observation: Float[Array, "n features"], raw_variance: Float[Array, "n features"]) -> tuple:
-        """Natural parameters of the Gaussian likelihood: r / s and 1 / s."""
+        """Return the natural parameters r / s and 1 / s of the Gaussian likelihood."""
         precision = PRECISION[self.rectifier](raw_variance)
         return observation * precision, precision
 
     @nn.compact
     def lower(self, summary: tuple[Array, Array]) -> Float[Array, "receivers features"]:
-        """Adds the prior and turns natural parameters into mean and variance."""
+        """Add the prior and convert the natural parameters to mean and variance."""
         weighted, precision = summary
         if self.prior_variance is not None:
             raw = self._prior("prior_variance", self.prior_variance, weighted.shape[-1])
@@ -179,9 +184,9 @@ class Bayesian(nn.Module):
         return jnp.concatenate([weighted * variance, variance], -1) if self.output_variance else weighted * variance
 
     def weights(self, view: DenseView) -> Float[Array, "receivers slots"]:
-        """(1 / s_n) / sum_n (1 / s_n), mean over the features; what the prior adds is left out."""
+        """Return (1 / s_n) / sum_n (1 / s_n), mean over the features, without the share of the prior."""
         raw_variance = jnp.split(view.messages, 2, -1)[1]
-        return sets.shares(PRECISION[self.rectifier](raw_variance), view.mask)
+        return sets.normalized_weights(PRECISION[self.rectifier](raw_variance), view.mask)
 
     def _prior(self, name: str, kind: str, num_features: int) -> Array:
         if kind == "fixed":

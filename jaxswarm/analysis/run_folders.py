@@ -112,7 +112,7 @@ def seeds(
     for folder in folders:
         mine, num_left_out = curves.from_rows(folder.rows, x, y)
         if num_left_out:
-            warn(f"{folder.path}: left out {num_left_out} evaluations whose {y} is not finite")
+            warn(f"{folder.path}: number of evaluations left out because {y} is not finite: {num_left_out}")
         absent = sorted({row["seed"] for row in folder.rows} - mine.keys())
         if absent or not folder.rows:
             missing = f"seed {', '.join(map(str, absent))}" if absent else "the run"

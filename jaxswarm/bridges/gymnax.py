@@ -66,11 +66,11 @@ class Gymnax:
     ) -> tuple[Observation, Any, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], dict[str, Any]]:
         """Take a step; return (observation, state, reward, terminated, truncated, info).
 
-        `action` is [agents, action_dim] and is clipped to [-1, 1]. `reward` is a scalar; `terminated` and `truncated`
-        are scalar bools. If either is true, the returned observation and state are those of a new episode.
+        `action` is [agents, action_dim] and is clipped to [-1, 1]. `reward` is a scalar float; `terminated` and
+        `truncated` are scalar bools. If either is true, the returned observation and state are those of a new episode.
 
-        `info` is a dict with the scalar metrics of the task, `terminated`, `truncated`, and `final_observation`: the
-        observation after the step and before a reset, which has the bootstrap value at truncation.
+        `info` is a dict with the scalar metrics of the task, `terminated`, `truncated`, and `final_observation`. This
+        is the observation after the step and before a reset. Use it for the bootstrap value at truncation.
         """
         task = self.task if params is None else params
         step_key, reset_key = jax.random.split(key)

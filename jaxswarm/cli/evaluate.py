@@ -25,13 +25,13 @@ HELP = """\
 jaxswarm-eval PATH [key=value ...] [task.KEY=VALUE[,VALUE...] ...]
 
 Evaluates the trained policy of a run folder, prints a table, and writes all results as JSON into the folder. The action
-is the mean of the policy. Each episode has its own start state. If the run has several seeds, the policy of each seed is
-evaluated: the table shows means over the seeds, and the file also contains the values of each seed.
+is the mean of the policy. Each episode has its own start state. If the run has several seeds, the policies of all seeds
+are evaluated. The table shows means over the seeds, and the file also contains the values of each seed.
 
 options
   PATH                Run folder. Required.
   episodes=N          Number of episodes of each policy. Integer >= 1, default: num_eval_envs of the run.
-  seed=N              Seed of the start states. Integer >= 0, default: 0.
+  seed=N              Seed of the episodes. Integer >= 0, default: 0.
   checkpoint=NAME     Checkpoint: best or last, default: best. The best one has the highest mean return over the seeds.
   train_seed=N        Evaluate only the policy of this seed of the run. Integer, default: all seeds.
   task.KEY=VALUE,...  Change a field of the task. Several values evaluate the policy on each of them. The type is that
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0 if arguments else 2
     paths, options, overrides = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
-        raise ConfigError(f"PATH: must be one run folder, got {len(paths)}; use jaxswarm-eval PATH [key=value ...]")
+        raise ConfigError(f"give one run folder, got {len(paths)}: jaxswarm-eval PATH [key=value ...]")
     which = which_checkpoint(options)
     config = load_config(paths[0])
     episodes = parse_integer("episodes", options.get("episodes", config["num_eval_envs"]), 1)

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0 if arguments else 2
     paths, options, overrides = split_paths(arguments, OPTIONS)
     if len(paths) != 1:
-        raise ConfigError(f"PATH: must be one run folder, got {len(paths)}; use jaxswarm-export PATH [key=value ...]")
+        raise ConfigError(f"give one run folder, got {len(paths)}: jaxswarm-export PATH [key=value ...]")
     pairs = configs.parse(overrides)
     require_task_keys(pairs, load_config(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "policy.jax"))

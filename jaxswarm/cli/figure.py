@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxswarm import config as configs
+from jaxswarm.cli.help import figures_help
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
 from jaxswarm.files import replace_text
@@ -160,11 +160,7 @@ def _scale(text: str) -> float:
 
 
 def _figures_help() -> str:
-    """Figures with the comment of each file."""
+    """Return the figures with their descriptions."""
     from jaxswarm.figures import figure as figures  # noqa: PLC0415
 
-    lines = ["figures"]
-    for name in figures.names():
-        with open(configs.config_dir() / configs.FIGURES / f"{name}.yaml", encoding="utf-8") as file:
-            lines.append(f"  {name:<18} {file.readline()[2:].strip()}")
-    return "\n".join(lines)
+    return figures_help(figures.names())

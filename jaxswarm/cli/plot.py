@@ -11,31 +11,39 @@ import numpy as np
 from jaxswarm.analysis import curves, plots
 from jaxswarm.analysis import run_folders as runs
 from jaxswarm.analysis.curves import STATISTICS, Curve
-from jaxswarm.analysis.plots import Picture, Series
+from jaxswarm.analysis.plots import Plot, Series
 from jaxswarm.analysis.run_folders import RunFolder
 from jaxswarm.cli.program import parse_integer, program, split, wants_help
 from jaxswarm.config import ConfigError, schema
 from jaxswarm.files import replace_text
 
 HELP = """\
-jaxswarm-plot PATH... [out=FILE.png] [key=value ...]
+jaxswarm-plot PATH... [key=value ...]
 
-Draws learning curves of runs with their spread over seeds, and writes the points as CSV beside the picture. A PATH is
-a run folder or a folder that holds some. Runs that differ in nothing but seed, length, checkpoints and times of
-evaluation are one group; the groups are named by what they differ in.
+Plots learning curves of runs with their spread over seeds, and writes the points as CSV next to the plot. Runs form a
+group if they differ only in seed, length, checkpoints and times of evaluation. Groups are labeled by the settings that
+differ.
 
-  out=plot.png             .png, .svg or .pdf
-  kind=curve               curve; profile: how many seeds end above each return; threshold: how many reached one, when
-  threshold=VALUE          of kind=threshold
-  statistic=median         median with quartiles; iqm: interquartile mean with 95 % stratified bootstrap intervals
-  seeds=true               each seed thin behind the line of its group; of kind=curve
-  y=eval/return            any column of metrics.csv
-  x=agent_steps            agent_steps, wall_seconds or update
-  log=                     logarithmic axes: x, y or xy
-  smooth=N                 each evaluation averaged with the N-1 before it, seed by seed
-  reference=FILE.csv,...   curves to compare with: columns series, agent_steps, median, q25, q75
-  series=TEXT              only those series of the references whose names contain the text
-  title=TEXT
+options
+  PATH...                  Run folders, or folders that contain run folders. Required.
+  out=FILE                 Path of the plot: .png, .svg or .pdf, default: plot.png.
+  kind=KIND                Kind of plot, default: curve.
+                           curve: a statistic over seeds against x.
+                           profile: the fraction of seeds that end above each value of y.
+                           threshold: the fraction of seeds that have reached a value of y, against x.
+  threshold=VALUE          Value of kind=threshold. Number, required there.
+  statistic=NAME           Statistic of kind=curve, default: median.
+                           median: median with quartiles.
+                           iqm: interquartile mean with 95 % stratified bootstrap intervals.
+  seeds=BOOL               Also plot each seed of kind=curve as a thin line: true or false, default: false.
+  y=COLUMN                 Column of metrics.csv for the vertical axis, default: eval/return.
+  x=COLUMN                 Horizontal axis: agent_steps, wall_seconds or update, default: agent_steps.
+  log=AXES                 Logarithmic axes: x, y or xy, default: none.
+  smooth=N                 Replace each evaluation of a seed by the mean of the last N. Integer >= 1, default: 1.
+  reference=FILE.csv,...   Overlay the curves of CSV files with the columns series, agent_steps, median, q25 and q75,
+                           default: none.
+  series=TEXT              Overlay only references whose names contain the text, default: all.
+  title=TEXT               Title of the plot, default: the parts that all groups share, if there are several groups.
 
 examples
   jaxswarm-plot runs
@@ -48,7 +56,7 @@ UNITS = {"agent_steps": "agent steps", "wall_seconds": "seconds", "update": "upd
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What to draw, and where."""
+    """Options of the program, as text from the command line."""
 
     out: str = ""
     kind: str = "curve"
@@ -70,7 +78,7 @@ class Options:
                 raise ConfigError(f"{name}: must be one of {choices}, got {getattr(self, name)!r}")
         parse_integer("smooth", self.smooth, 1)
         if self.kind == "threshold" and not _is_number(self.threshold):
-            raise ConfigError(f"threshold: must be a number, like threshold=-30, got {self.threshold!r}")
+            raise ConfigError(f"threshold: must be a number such as threshold=-30, got {self.threshold!r}")
         if self.threshold and self.kind != "threshold":
             raise ConfigError(f"threshold: must be used with kind=threshold, got kind={self.kind}")
         if self.statistic != Options.statistic and self.kind != "curve":
@@ -89,7 +97,7 @@ class Options:
 
 @program
 def main(arguments: Sequence[str]) -> int:
-    """Draws a picture of runs; returns the exit code."""
+    """Plot runs; return the exit code."""
     if wants_help(arguments) or not arguments:
         print(HELP)
         return 0 if arguments else 2
@@ -99,12 +107,12 @@ def main(arguments: Sequence[str]) -> int:
     references = [series for file in files for series in _references(Path(file), options)]
     groups = _groups([runs.read(path) for path in runs.find(paths)], options)
     title = options.title or (_shared_name(groups) if len(groups) > 1 else "")
-    picture = KINDS[options.kind](_seeds(groups, options), options)
-    caption = picture.caption + ("; dashed: references, median and quartiles" if references else "")
-    series = [*picture.series, *references]
-    picture = dataclasses.replace(picture, series=series, title=title, caption=caption, log=options.log)
-    _write(out, picture)
-    for series in picture.series:
+    plot = KINDS[options.kind](_seeds(groups, options), options)
+    caption = plot.caption + ("; dashed: references, median and quartiles" if references else "")
+    series = [*plot.series, *references]
+    plot = dataclasses.replace(plot, series=series, title=title, caption=caption, log=options.log)
+    _write(out, plot)
+    for series in plot.series:
         if not series.is_reference:
             print(f"{series.label}: {series.note}")
     print(f"wrote {out}\nwrote {out.with_suffix('.csv')}")
@@ -112,7 +120,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
-    """Options, and paths; what exists is a path, whatever is in its name."""
+    """Return options and paths. An argument that exists as a file or folder is a path, even if it contains "="."""
     names = [field.name for field in dataclasses.fields(Options)]
     options, overrides = split(arguments, names)
     for word in overrides:
@@ -121,12 +129,15 @@ def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
             near = schema.nearest(name, names)
             raise ConfigError(f"unknown key {name!r}{near}; valid keys: {', '.join(names)}")
     if not overrides:
-        raise ConfigError("give a run folder, or a folder that holds some: jaxswarm-plot PATH... [key=value ...]")
+        raise ConfigError("give a run folder, or a folder that contains some: jaxswarm-plot PATH... [key=value ...]")
     return Options(**options), [Path(word) for word in overrides]
 
 
 def _output(out: str) -> Path:
-    """Where the picture goes; a `ConfigError` if that, or the table beside it, would replace something else."""
+    """Return the path of the plot.
+
+    Raises a `ConfigError` if the plot or its table would replace a file that this program did not write.
+    """
     path = Path(out or "plot.png")
     table = path.with_suffix(".csv")
     if path.suffix[1:].lower() not in plots.FORMATS:
@@ -135,20 +146,20 @@ def _output(out: str) -> Path:
         raise ConfigError(f"out: must be a file, got the folder {out!r}")
     is_ours = table.exists() and table.read_bytes().startswith(",".join(plots.COLUMNS).encode())
     if table.exists() and not is_ours:
-        raise ConfigError(f"out = {path} would replace {table}, which is no table of this program; choose another name")
+        raise ConfigError(f"out={path} would replace {table}, which jaxswarm-plot did not write; choose another name")
     if not out and path.exists() and not is_ours:
-        raise ConfigError(f"{path} exists and is no picture of this program; choose a name with out=FILE.png")
+        raise ConfigError(f"{path} exists, and jaxswarm-plot did not write it; choose a name with out=FILE.png")
     return path
 
 
 def _references(path: Path, options: Options) -> list[Series]:
-    """The curves of a CSV file; the legend says which file they come from and of how many runs they are."""
+    """Read the curves of a CSV file. Their notes in the legend are the name of the file and the number of runs."""
     try:
         lines = curves.read_lines(path)
     except OSError as error:
-        raise ConfigError(f"cannot read reference={path}: {error.strerror}") from error
+        raise ConfigError(f"reference: cannot read {path}: {error.strerror}") from error
     except ValueError as error:
-        raise ConfigError(f"cannot read reference={path}: {error}") from error
+        raise ConfigError(f"reference: cannot read {path}: {error}") from error
     chosen = {name: line for name, line in lines.items() if options.series.lower() in name.lower()}
     if not chosen:
         raise ConfigError(
@@ -159,7 +170,7 @@ def _references(path: Path, options: Options) -> list[Series]:
 
 
 def _groups(folders: Sequence[RunFolder], options: Options) -> dict[str, list[RunFolder]]:
-    """The groups of runs, once it is known that there is something to draw of them."""
+    """Group the runs. Raise a `ConfigError` if there are no evaluations, or no such columns."""
     columns = sorted({name for folder in folders for row in folder.rows[:1] for name in row} - {"seed"})
     if not columns:
         raise ConfigError("the runs have no evaluation yet")
@@ -172,33 +183,33 @@ def _groups(folders: Sequence[RunFolder], options: Options) -> dict[str, list[Ru
 
 
 def _seeds(groups: Mapping[str, Sequence[RunFolder]], options: Options) -> dict[str, list[Curve]]:
-    """Each group's curves, smoothed if asked for; groups without any are left out."""
+    """Return the curves of each group, smoothed by the option `smooth`. Groups without curves are left out."""
     found = {label: runs.seeds(members, options.x, options.y, _warn) for label, members in groups.items()}
     size = int(options.smooth)
     found = {label: [curves.trailing_mean(x, size) for x in seeds] for label, seeds in found.items() if seeds}
     if not found:
-        raise ConfigError(f"nothing to draw: no run has a finite {options.y}")
+        raise ConfigError(f"y: must be finite in at least one run, got no finite {options.y}")
     return found
 
 
-def _curve(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
+def _curve(groups: Mapping[str, Sequence[Curve]], options: Options) -> Plot:
     statistic = STATISTICS[options.statistic]
     lines = {label: curves.summarize(seeds, options.statistic) for label, seeds in groups.items()}
     series = []
     for label, line in lines.items():
-        shown = groups[label] if options.seeds == "true" else ()
+        thin_lines = groups[label] if options.seeds == "true" else ()
         most, last = int(line.num_seeds.max()), int(line.num_seeds[-1])
         note = plots.seed_count(most) + (f", {last} at the end" if last < most else "")
-        series.append(Series(label, line, note, seeds=shown))
+        series.append(Series(label, line, note, seeds=thin_lines))
     caption = f"{statistic.name} and {statistic.band} over seeds".capitalize()
     caption += ", and each seed" if options.seeds == "true" else ""
     if any(np.ptp(line.num_seeds) for line in lines.values()):
         caption += "; pale where not all seeds have values"
-    height = f"{options.statistic} of {options.y}"
-    return Picture("curve", series, options.x, height, _name(options), caption=_smoothed(caption, options))
+    y_name = f"{options.statistic} of {options.y}"
+    return Plot("curve", series, options.x, y_name, _name(options), caption=_smoothed(caption, options))
 
 
-def _profile(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
+def _profile(groups: Mapping[str, Sequence[Curve]], options: Options) -> Plot:
     finals = {label: np.array([curve.y[-1] for curve in seeds]) for label, seeds in groups.items()}
     at = np.unique(np.concatenate(list(finals.values())))
     margin = 0.05 * (np.ptp(at) or abs(at[0]) or 1.0)
@@ -209,26 +220,26 @@ def _profile(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture
     caption += f" (the first to end: {_amount(min(ends), options.x)})" if min(ends) < max(ends) else ""
     caption = _smoothed(f"{caption}; 95 % stratified bootstrap intervals", options)
     fraction = "fraction of seeds that end above"
-    return Picture("profile", series, _name(options), fraction, fraction, caption=caption, is_step=True)
+    return Plot("profile", series, _name(options), fraction, fraction, caption=caption, is_step=True)
 
 
-def _threshold(groups: Mapping[str, Sequence[Curve]], options: Options) -> Picture:
+def _threshold(groups: Mapping[str, Sequence[Curve]], options: Options) -> Plot:
     threshold, series = float(options.threshold), []
     for label, seeds in groups.items():
         times, is_reached = curves.times_to(seeds, threshold)
         line = curves.reaching(seeds, threshold)
         half = line.x[line.y >= 0.5]
-        when = f"half by {_amount(half[0], options.x)}" if half.size else "fewer than half"
-        note = f"{is_reached.sum()} of {plots.seed_count(len(seeds))}, {when}"
+        half_text = f"half by {_amount(half[0], options.x)}" if half.size else "fewer than half"
+        note = f"{is_reached.sum()} of {plots.seed_count(len(seeds))}, {half_text}"
         series.append(Series(label, line, note, censored=np.sort(times[~is_reached])))
     fraction = f"fraction of seeds that reached {options.threshold}"
     caption = f"{_name(options)}, first evaluation at or above {options.threshold}".capitalize()
     caption += "; Kaplan-Meier estimate with 95 % intervals; ticks: seeds that ended before"
     caption = _smoothed(caption, options)
-    return Picture("threshold", series, options.x, fraction, fraction, caption=caption, is_step=True)
+    return Plot("threshold", series, options.x, fraction, fraction, caption=caption, is_step=True)
 
 
-KINDS: dict[str, Callable[[Mapping[str, Sequence[Curve]], Options], Picture]] = {
+KINDS: dict[str, Callable[[Mapping[str, Sequence[Curve]], Options], Plot]] = {
     "curve": _curve,
     "profile": _profile,
     "threshold": _threshold,
@@ -244,21 +255,21 @@ CHOICES = {
 }
 
 
-def _write(out: Path, picture: Picture) -> None:
+def _write(out: Path, plot: Plot) -> None:
     try:
-        plots.check(picture)
+        plots.check(plot)
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    if "x" in picture.log:
-        hidden = sum(int((series.line.x <= 0).sum()) for series in picture.series)
+    if "x" in plot.log:
+        hidden = sum(int((series.line.x <= 0).sum()) for series in plot.series)
         if hidden:
-            _warn(f"a logarithmic axis has no place for {picture.x_name} = 0; points left out: {hidden}")
+            _warn(f"a logarithmic axis cannot show {plot.x_name} = 0; number of points left out: {hidden}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        replace_text(out.with_suffix(".csv"), plots.table(picture))
-        plots.draw(out, picture)
+        replace_text(out.with_suffix(".csv"), plots.table(plot))
+        plots.draw(out, plot)
     except OSError as error:
-        raise ConfigError(f"cannot write to {out.parent}: {error.strerror}") from error
+        raise ConfigError(f"out: cannot write to {out.parent}: {error.strerror}") from error
 
 
 def _warn(text: str) -> None:
@@ -270,7 +281,7 @@ def _shared_name(groups: Mapping[str, Sequence[RunFolder]]) -> str:
 
 
 def _name(options: Options) -> str:
-    """What `y` is called in words."""
+    """Return the label of the column `y`."""
     return NAMES.get(options.y, options.y)
 
 
@@ -279,7 +290,7 @@ def _smoothed(caption: str, options: Options) -> str:
 
 
 def _amount(value: float, name: str) -> str:
-    """A number of the horizontal axis in words."""
+    """Format a value of the horizontal axis with its unit, such as "2.5 million agent steps"."""
     size, unit = (1e6, "million ") if value >= 1e6 else (1, "")
     return f"{value / size:,.4g} {unit}{UNITS[name]}"
 

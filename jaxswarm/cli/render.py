@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0 if arguments else 2
     paths, options, overrides = split_paths(arguments, OPTIONS)
     if not paths:
-        raise ConfigError("PATH: must be at least one run folder, got none; use jaxswarm-render PATH... [key=value ...]")
+        raise ConfigError("give at least one run folder: jaxswarm-render PATH... [key=value ...]")
     seed = parse_integer("seed", options.get("seed", 0), 0)
     sizes = {name: parse_integer(name, options[name], 1) for name in ("frames", "until") if name in options}
     pairs = configs.parse(overrides)
@@ -81,7 +81,10 @@ def main(arguments: Sequence[str]) -> int:
 def _film(
     run_dir: Path, pairs: Sequence[tuple[str, Any]], options: Mapping[str, str], seed: int, num_films: int
 ) -> Any:
-    """Record an episode of the policy of a run; return `None` if it cannot be restored. All films share `MAX_SHARES`."""
+    """Record an episode of the policy of a run; return `None` if it cannot be restored.
+
+    All `num_films` films together have at most `render.MAX_SHARES` weights.
+    """
     found = policy_on_task(run_dir, pairs, options)
     if found is None:
         return None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
+from jaxswarm.cli.help import keys_help
 from jaxswarm.cli.policy_options import restore_policies
 from jaxswarm.cli.program import (
     command,
@@ -47,7 +48,7 @@ examples
 def main(arguments: Sequence[str]) -> int:
     """Train or resume a run; return the exit code."""
     if wants_help(arguments):
-        print(HELP + "\n" + _keys_help([word for word in arguments if "=" in word]))
+        print(HELP + "\n" + keys_help([word for word in arguments if "=" in word]))
         return 0
     if join_processes():
         return _train(arguments, is_first=True)
@@ -128,41 +129,6 @@ def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
     returns = [row["eval/return"] for row in rows if row["update"] == update]
     low, median, high = np.percentile(returns, [25, 50, 75])
     return f"{median:.2f}" if len(returns) == 1 else f"{median:.2f} [{low:.2f}, {high:.2f}] over {len(returns)} seeds"
-
-
-def _keys_help(overrides: Sequence[str]) -> str:
-    """Groups with the first comment of each file, and keys as the files document them, those of the chosen groups."""
-    config = configs.compose(overrides)  # an error for what does not exist
-    lines, chosen = ["groups (* default)"], dict(configs.parse(overrides))
-    main = (configs.config_dir() / "train.yaml").read_text()
-    for group, names in configs.choices().items():
-        for name in names:
-            path = configs.config_dir() / group / f"{name}.yaml"
-            text = path.read_text().splitlines() if path.exists() else ["# of your own"]
-            comments = (line[2:] for line in text if line.startswith("# ") and not line.startswith("# @"))
-            is_default = f"- {group}: {name}\n" in main
-            if is_default:
-                chosen.setdefault(group, name)
-            lines.append(f"  {'*' if is_default else ' '} {f'{group}={name}':<30} {next(comments, '')}")
-    keys = main[main.index("_self_") :].split("\n", 2)[2].strip().splitlines()
-    lines += ["", "keys", *[f"  {line}" for line in keys]]
-    for part in configs.PARTS:
-        fields = _documented(part, chosen[part], config)
-        if fields:
-            lines += ["", f"keys of {part}={chosen[part]}", *[f"  {part}.{line}" for line in fields.values()]]
-    return "\n".join(lines)
-
-
-def _documented(part: str, choice: str, config: Config) -> dict[str, str]:
-    """The lines of a group's file by key, and of those that it builds on; what users registered has no file."""
-    path = configs.config_dir() / part / f"{choice}.yaml"
-    if not path.exists():
-        return {name: f"{name}: {value}" for name, value in config[part].items() if name != "name"}
-    lines = {}
-    for default in configs.read(path).get("defaults", []):
-        lines |= _documented(part, default, config)
-    of_keys = [line for line in path.read_text().splitlines() if line.partition(": ")[0].isidentifier()]
-    return lines | {line.partition(":")[0]: line for line in of_keys if not line.startswith("name:")}
 
 
 def _default_run_dir(config: Config) -> str:

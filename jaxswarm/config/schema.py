@@ -36,7 +36,8 @@ def descriptions(cls: type) -> dict[str, str]:
 
 def summary(cls: type) -> str:
     """Return the first paragraph of the docstring of a class in one line; empty without a docstring."""
-    return " ".join((vars(cls).get("__doc__") or "").partition("\n\n")[0].split())
+    text = " ".join((cls.__doc__ or "").partition("\n\n")[0].split())
+    return "" if text.startswith(f"{cls.__name__}(") else text  # dataclasses write their signature there
 
 
 def check(value: Any, annotation: Any, name: str) -> Any:

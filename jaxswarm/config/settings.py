@@ -44,8 +44,8 @@ class RunSettings:
 
     def __post_init__(self) -> None:
         if (self.num_updates is None) == (self.total_agent_steps is None):
-            given = f"num_updates={self.num_updates}, total_agent_steps={self.total_agent_steps}"
-            raise ConfigError(f"length: must be given by one of num_updates and total_agent_steps, got {given}")
+            given = f"{self.num_updates} and {self.total_agent_steps}"
+            raise ConfigError(f"num_updates and total_agent_steps: exactly one must be set, got {given}")
         for field in dataclasses.fields(self):
             name, value = field.name, getattr(self, field.name)
             bound = 0 if name in ("seed", "checkpoint_seconds") else 1

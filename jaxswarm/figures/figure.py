@@ -78,6 +78,7 @@ def load_figure(name: str) -> Figure:
     if name not in names():
         raise ConfigError(f"figure: must be one of all, {', '.join(names())}, got {name!r}")
     fields: dict[str, Any] = configs.read(configs.config_dir() / configs.FIGURES / f"{name}.yaml")
+    del fields["description"]
     overrides, reference = fields.pop("overrides").split(), fields.pop("reference", None)
     thesis = fields.pop("thesis", None) or {series: series for series in fields["series"]}
     fields["series"] = {series: (*overrides, *own.split()) for series, own in fields["series"].items()}

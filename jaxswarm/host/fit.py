@@ -72,7 +72,7 @@ def fit(
         ConfigError: A setting is impossible.
     """
     for name in log_to:
-        loggers.load(name)
+        loggers.import_package(name)
     given: dict[str, Any] = {
         "seed": seed,
         "num_seeds": 1 if num_seeds is None else num_seeds,

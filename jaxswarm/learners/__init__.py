@@ -1,4 +1,4 @@
-"""Learners: how a policy gets better from trajectories."""
+"""Learners, which improve a policy from trajectories: PPO and trust region layers (TRL)."""
 
 from jaxswarm.learners.ppo import PPO
 from jaxswarm.learners.projections import PROJECTIONS

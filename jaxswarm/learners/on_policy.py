@@ -1,7 +1,7 @@
-"""What on-policy learners share: hyper-parameters, values, advantages, samples, and descent by minibatches.
+"""Shared parts of on-policy learners: hyperparameters, values, advantages, samples and minibatch gradient descent.
 
-Every agent's step is a sample of its own, with the common reward and that agent's own value. Samples are numbered
-[steps, worlds, agents] in this order. Those of agents that did not exist have no influence on any loss.
+Each step of each agent is a sample, with the common reward and the agent's own value. Samples are numbered in the order
+[steps, envs, agents]. Samples of absent agents have no influence on any loss.
 """
 
 import dataclasses
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, TypeVar
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -17,24 +18,40 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxswarm import checks
 from jaxswarm.checks import require
+from jaxswarm.networks import Network
 from jaxswarm.rollout import Trajectory, spread_rows
 from jaxswarm.types import Key, Metrics, Observation, pytree, static
 
-Params = Any
-Mask = Bool[Array, "*rows"] | None  # rows that exist; None: all do
+Params = Any  # the parameters of a network, a pytree of arrays
+Mask = Bool[Array, "*rows"] | None  # rows of present agents; None: all are present
 
-USUAL_BATCH_SIZE = 1280
-FEWEST_COLUMNS = 8  # that are shuffled without sorting
+DEFAULT_BATCH_SIZE = 1280
+MIN_FEISTEL_COLUMNS = 8  # `shuffled` sorts matrices with fewer columns
 
 
 @pytree
 class OnPolicy:
-    """Hyper-parameters of every on-policy learner.
+    """Hyperparameters of all on-policy learners.
 
-    A minibatch has `batch_size` samples, or the possible number nearest to 1280: rows of single agents drawn at random,
-    or those of all agents of randomly drawn worlds, which is faster because they share most of the perceiving. With
-    `bootstrap_truncation` the value of the last state stands for what would have come after a time limit; without,
-    a time limit counts as the end of the world, as in the thesis.
+    The sampling unit `envs` is faster because the agents of an environment share most of the work of `perceive`.
+
+    Attributes:
+        learning_rate: The Adam optimizer uses this constant learning rate (> 0).
+        discount: Future rewards are discounted by this factor per step (0 to 1), called gamma in the literature.
+        gae_lambda: Generalized advantage estimation weights each further step by this factor (0 to 1; 0: one step only,
+            1: all steps to the end of the episode).
+        value_coefficient: The total loss contains the value loss with this weight (>= 0).
+        entropy_coefficient: The total loss contains the entropy bonus with this weight (>= 0).
+        max_grad_norm: Gradients are clipped to this global norm (> 0).
+        adam_epsilon: Adam adds this number (> 0) to the denominator of its steps.
+        num_epochs: Each update passes over all samples this many times (an integer >= 1).
+        batch_size: Each gradient step uses this many samples (an integer >= 2 that divides num_envs * num_steps *
+            num_agents and, with `sampling_unit=envs`, is a multiple of num_agents; null: the possible number nearest to
+            1280).
+        sampling_unit: Minibatches consist of all agents of randomly drawn environments (`envs`), or of randomly drawn
+            single agents (`agents`, as in the thesis).
+        bootstrap_truncation: At a time limit, advantages bootstrap from the value of the last state if true; if false,
+            a time limit counts as a terminal state, as in the thesis.
     """
 
     learning_rate: float = 3e-3
@@ -51,9 +68,8 @@ class OnPolicy:
 
 
 def check(learner: OnPolicy) -> None:
-    """A `ValueError` names the first of these hyper-parameters that is not possible."""
-    positive = ("learning_rate", "max_grad_norm", "adam_epsilon")
-    require(learner, checks.POSITIVE_FINITE, *positive)
+    """Raise a `ValueError` for the first of these hyperparameters that is out of its range."""
+    require(learner, checks.POSITIVE_FINITE, "learning_rate", "max_grad_norm", "adam_epsilon")
     require(learner, checks.UNIT_INTERVAL, "discount", "gae_lambda")
     require(learner, checks.NOT_NEGATIVE, "value_coefficient", "entropy_coefficient")
     require(learner, checks.integer(1), "num_epochs")
@@ -63,35 +79,39 @@ def check(learner: OnPolicy) -> None:
 
 
 def batch_size(learner: OnPolicy, num_samples: int, num_agents: int) -> int:
-    """Samples per gradient step; a `ValueError` says which sizes are possible if the one asked for is not."""
-    asked = learner.batch_size
+    """Return the number of samples per gradient step.
+
+    Raises a `ValueError` with possible sizes if the learner's `batch_size` is not possible.
+    """
+    requested = learner.batch_size
     nearest = nearest_batch_sizes(learner, num_samples, num_agents)
-    if nearest and (asked is None or asked == nearest[0]):
+    if nearest and requested in (None, nearest[0]):
         return nearest[0]
-    unit = _unit(learner, num_agents)
+    unit_size = _unit_size(learner, num_agents)
     raise ValueError(
-        f"batch_size: must divide num_envs * num_steps * num_agents = {num_samples} and be a multiple of {unit}, "
-        f"for example {', '.join(map(str, sorted(nearest[:4]))) or 'none'}, got {asked}"
+        f"batch_size: must divide num_envs * num_steps * num_agents = {num_samples} and be a multiple of {unit_size}, "
+        f"for example {', '.join(map(str, sorted(nearest[:4]))) or 'none'}, got {requested}"
     )
 
 
 def nearest_batch_sizes(learner: OnPolicy, num_samples: int, num_agents: int) -> list[int]:
-    """All that are possible, the one nearest to the learner's or to the usual one first."""
-    unit = _unit(learner, num_agents)
-    num_units = num_samples // unit
+    """Return all possible batch sizes, sorted by their distance from the learner's or the default batch size."""
+    unit_size = _unit_size(learner, num_agents)
+    num_units = num_samples // unit_size
     small = [n for n in range(1, math.isqrt(num_units) + 1) if num_units % n == 0]
-    possible = [unit * n for n in sorted({*small, *(num_units // n for n in small)}) if unit * n > 1]
-    return sorted(possible, key=lambda n: abs(n - (learner.batch_size or USUAL_BATCH_SIZE)))
+    divisors = sorted({*small, *(num_units // n for n in small)})
+    possible = [unit_size * n for n in divisors if unit_size * n > 1]
+    return sorted(possible, key=lambda n: abs(n - (learner.batch_size or DEFAULT_BATCH_SIZE)))
 
 
-def _unit(learner: OnPolicy, num_agents: int) -> int:
-    """Samples that a minibatch has or has not as a whole."""
+def _unit_size(learner: OnPolicy, num_agents: int) -> int:
+    """Return the number of samples of a sampling unit."""
     return 1 if learner.sampling_unit == "agents" else num_agents
 
 
 @pytree
 class LearnerState:
-    """Parameters of the network and of the optimizer."""
+    """Parameters of the network and state of the optimizer."""
 
     params: Params
     optimizer_state: optax.OptState
@@ -102,22 +122,22 @@ State = TypeVar("State", bound=LearnerState)
 
 @pytree
 class Minibatch:
-    """Samples to learn from, one row each."""
+    """Samples of one gradient step, one per row."""
 
     obs: Observation
     action: Float[Array, "rows action_dim"]
-    log_prob: Float[Array, " rows"]  # of the action under the policy that took it
+    log_prob: Float[Array, " rows"]  # of the action under the policy that acted
     advantage: Float[Array, " rows"]
-    target: Float[Array, " rows"]  # for the value
-    action_mean: Float[Array, "rows action_dim"] | None = None  # of the policy that took it, for those who ask
+    target: Float[Array, " rows"]  # of the value
+    action_mean: Float[Array, "rows action_dim"] | None = None  # of the policy that acted; only TRL needs it
     action_std: Float[Array, "rows action_dim"] | None = None
 
 
 @pytree
 class Samples:
-    """All samples of a trajectory, numbered [steps, worlds, agents]; observations are recomputed from the views."""
+    """All samples of a trajectory, in the order [steps, envs, agents]; observations are recomputed from the views."""
 
-    view: Any  # [steps * worlds, ...]
+    view: Any  # of the task, [steps * envs, ...]
     action: Float[Array, "samples action_dim"]
     log_prob: Float[Array, " samples"]
     advantage: Float[Array, " samples"]
@@ -130,7 +150,7 @@ Loss = Callable[[Params, Minibatch], tuple[Array, Metrics]]
 
 
 def adam(learner: OnPolicy) -> optax.GradientTransformation:
-    """Adam, on shortened gradients."""
+    """Return Adam on clipped gradients."""
     return optax.chain(
         optax.clip_by_global_norm(learner.max_grad_norm),
         optax.adam(learner.learning_rate, eps=learner.adam_epsilon),
@@ -138,9 +158,13 @@ def adam(learner: OnPolicy) -> optax.GradientTransformation:
 
 
 def update(
-    learner: OnPolicy, loss: Loss, key: Key, state: State, network: Any, task: Any, trajectory: Trajectory
+    learner: OnPolicy, loss: Loss, key: Key, state: State, network: Network, task: Any, trajectory: Trajectory
 ) -> tuple[State, Metrics]:
-    """Descends `loss` on the samples of one trajectory, all epochs."""
+    """Minimize `loss` on the samples of one trajectory, in all epochs.
+
+    Raises a `ValueError` if the shapes of the trajectory do not fit.
+    """
+    check_trajectory(trajectory)
     value, next_value = trajectory_values(network, state.params, task, trajectory)
     is_done = trajectory.terminated | trajectory.truncated
     is_terminal = trajectory.terminated if learner.bootstrap_truncation else is_done
@@ -152,7 +176,7 @@ def update(
         next_value,
         learner.discount,
         learner.gae_lambda,
-        gone_after(task, trajectory),
+        next_absent(task, trajectory),
     )
     target = advantage + value
     samples = stored_samples(task, trajectory, advantage, target)
@@ -170,18 +194,36 @@ def update(
     return state, metrics | {"explained_variance": explained_variance(value, target, trajectory.mask)}
 
 
+def check_trajectory(trajectory: Trajectory) -> None:
+    """Raise a `ValueError` unless leaves have the leading axes [steps, envs] or, per agent, [steps, envs, agents].
+
+    The check runs at tracing and costs nothing in the compiled program.
+    """
+    actions = [trajectory.action, trajectory.action_mean, trajectory.action_std]
+    per_agent = (actions, trajectory.log_prob, trajectory.mask)
+    message = "trajectory: must have leaves with the same leading axes [steps, envs, ...]"
+    chex.assert_tree_shape_prefix(
+        trajectory, trajectory.reward.shape, custom_message=message, exception_type=ValueError
+    )
+    message = "trajectory: must have actions [steps, envs, agents, action_dim], log_prob and mask [steps, envs, agents]"
+    chex.assert_equal_shape(actions, custom_message=message, exception_type=ValueError)
+    chex.assert_tree_shape_prefix(
+        per_agent, trajectory.action.shape[:-1], custom_message=message, exception_type=ValueError
+    )
+
+
 def trajectory_values(
-    network: Any, params: Params, task: Any, trajectory: Trajectory
+    network: Network, params: Params, task: Any, trajectory: Trajectory
 ) -> tuple[Float[Array, "steps envs agents"], Float[Array, "steps envs agents"]]:
-    """Values of the state before each step, and of the state after it, before any reset."""
+    """Return the values of the state before each step, and of the state after it, before any reset."""
 
     def value(state: Any) -> Array:
         return network.apply(params, jax.vmap(task.observe)(state), method="value")
 
     def value_after(step: tuple) -> Array:
-        """Where no episode ended, the state after this step is the one before the next; the last step has no next."""
-        is_known, final_state, following = step
-        return jax.lax.cond(is_known, lambda: following, lambda: value(final_state))
+        """Return the values before the next step, which are known unless an episode ended or the step is the last."""
+        is_known, final_state, next_known = step
+        return jax.lax.cond(is_known, lambda: next_known, lambda: value(final_state))
 
     values = jax.lax.map(value, trajectory.state)
     is_known = ~(trajectory.terminated | trajectory.truncated).any(-1)
@@ -189,8 +231,8 @@ def trajectory_values(
     return values, jax.lax.map(value_after, (is_known, trajectory.final_state, jnp.roll(values, -1, axis=0)))
 
 
-def gone_after(task: Any, trajectory: Trajectory) -> Bool[Array, "steps envs #agents"]:
-    """Agents that do not exist after each step, before any reset."""
+def next_absent(task: Any, trajectory: Trajectory) -> Bool[Array, "steps envs #agents"]:
+    """Mark agents that are absent after each step, before any reset."""
     if trajectory.mask is None:
         return jnp.zeros((*trajectory.reward.shape, 1), bool)
     return ~jax.vmap(jax.vmap(task.observe))(trajectory.final_state).mask
@@ -204,15 +246,19 @@ def generalized_advantages(
     next_value: Float[Array, "steps envs agents"],
     discount: Float[Array, ""] | float,
     gae_lambda: Float[Array, ""] | float,
-    is_gone: Bool[Array, "steps envs #agents"] | bool = False,
+    is_next_absent: Bool[Array, "steps envs #agents"] | bool = False,
 ) -> Float[Array, "steps envs agents"]:
-    """Generalized advantage estimates (Schulman et al., 2016).
+    """Return the generalized advantage estimates of Schulman et al. (2016), eq. 16.
 
-    `is_terminal` steps have no value after them; `is_done` steps end an episode, so nothing flows back across them.
-    For agents that do not exist after a step, `is_gone`, it is both.
+    `is_terminal` marks steps without a bootstrap value; `is_done` marks the last step of an episode. `is_next_absent`
+    marks agents that are absent after a step; for them the step is both. Raises a `ValueError` if the shapes do not
+    fit.
     """
-    delta = reward[..., None] + discount * jnp.where(is_terminal[..., None] | is_gone, 0.0, next_value) - value
-    decay = discount * gae_lambda * (1.0 - (is_done[..., None] | is_gone))
+    chex.assert_equal_shape([reward, is_terminal, is_done], exception_type=ValueError)
+    chex.assert_shape([value, next_value], (*reward.shape, None), exception_type=ValueError)
+    chex.assert_equal_shape([value, next_value], exception_type=ValueError)
+    delta = reward[..., None] + discount * jnp.where(is_terminal[..., None] | is_next_absent, 0.0, next_value) - value
+    decay = discount * gae_lambda * (1.0 - (is_done[..., None] | is_next_absent))
 
     def backwards(advantage: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         delta, decay = step
@@ -228,7 +274,7 @@ def stored_samples(
     advantage: Float[Array, "steps envs agents"],
     target: Float[Array, "steps envs agents"],
 ) -> Samples:
-    """All samples of a trajectory."""
+    """Return all samples of a trajectory."""
     views = jax.vmap(jax.vmap(task.view))(trajectory.state)
     policy = (trajectory.action_mean, trajectory.action_std)
     arrays = (trajectory.action, trajectory.log_prob, advantage, target, *policy)
@@ -236,13 +282,16 @@ def stored_samples(
 
 
 def fetch_agents(task: Any, samples: Samples, sample: Int[Array, " rows"]) -> Minibatch:
-    """The samples of these numbers."""
+    """Return the samples with these numbers, for `sampling_unit="agents"`."""
     view = jax.tree.map(lambda x: x[sample // task.num_agents], samples.view)
     return _minibatch(samples, sample, jax.vmap(task.perceive)(view, sample % task.num_agents))
 
 
 def fetch_envs(task: Any, samples: Samples, env: Int[Array, " envs"]) -> Minibatch:
-    """The samples of all agents of the worlds of these numbers."""
+    """Return the samples of all agents of the environments with these numbers, for `sampling_unit="envs"`.
+
+    An environment is numbered per step, in the order [steps, envs].
+    """
     agent = jnp.arange(task.num_agents)
     view = jax.tree.map(lambda x: x[env], samples.view)
     obs = jax.vmap(jax.vmap(task.perceive, (None, 0)), (0, None))(view, agent)
@@ -259,18 +308,19 @@ def _minibatch(samples: Samples, sample: Int[Array, " rows"], obs: Observation) 
 
 
 def _merge(x: Array) -> Array:
-    """The two leading axes in one."""
+    """Merge the two leading axes."""
     return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
 
 
 def shuffled(key: Key, num_rows: int, num_columns: int) -> Int[Array, "rows columns"]:
-    """The numbers below rows * columns in pseudo-random order: a Feistel network with random tables.
+    """Return the integers below rows * columns in pseudo-random order, by a Feistel network with random tables.
 
-    Luby and Rackoff (1988) show why a few rounds suffice. Sorting, which is what `jax.random.permutation` does, took
-    a fifth of the time of an update on CPU; this takes less than a hundredth. Rows of a few numbers are sorted: with
-    one column the rounds would only turn the order round, and there are not many rows of such minibatches.
+    Luby and Rackoff (1988) show why a few rounds suffice. `jax.random.permutation` sorts, which took a fifth of the
+    time of an update on a CPU; the network takes less than a hundredth. Matrices with fewer than `MIN_FEISTEL_COLUMNS`
+    columns are sorted nevertheless: with one column the rounds would only rotate the order, and so few columns go with
+    few rows.
     """
-    if num_columns < FEWEST_COLUMNS:
+    if num_columns < MIN_FEISTEL_COLUMNS:
         return jax.random.permutation(key, num_rows * num_columns).reshape(num_rows, num_columns)
     tables = jax.random.bits(key, (4, num_columns + num_rows)) >> 1
     row, column = jnp.divmod(jnp.arange(num_rows * num_columns), num_columns)
@@ -290,12 +340,12 @@ def descend(
     num_minibatches: int,
     num_epochs: int,
 ) -> tuple[State, Metrics]:
-    """Minibatch gradient descent; each epoch goes through all units once, in a fresh random order.
+    """Run minibatch gradient descent; each epoch passes over all sampling units once, in a new random order.
 
-    The metrics are means over all minibatches; those called `..._max` are maxima.
+    The metrics are means over all minibatches, but maxima if their name ends with `_max`.
     """
 
-    def over(metrics: Metrics) -> Metrics:
+    def summarize(metrics: Metrics) -> Metrics:
         return {name: (jnp.max if name.endswith("_max") else jnp.mean)(x) for name, x in metrics.items()}
 
     def minibatch(state: State, units: Int[Array, " units"]) -> tuple[State, Metrics]:
@@ -308,26 +358,26 @@ def descend(
     def epoch(state: State, key: Key) -> tuple[State, Metrics]:
         order = shuffled(key, num_minibatches, num_units // num_minibatches)
         state, metrics = jax.lax.scan(minibatch, state, order)
-        return state, over(metrics)
+        return state, summarize(metrics)
 
     state, metrics = jax.lax.scan(epoch, state, jax.random.split(key, num_epochs))
-    return state, over(metrics)
+    return state, summarize(metrics)
 
 
 def mean(x: Float[Array, "*#rows"], mask: Mask) -> Float[Array, ""]:
-    """Mean over the rows that exist."""
+    """Return the mean over the rows of present agents."""
     if mask is None:
         return x.mean()
     return jnp.where(mask, x, 0.0).sum() / jnp.maximum(mask.sum(), 1)
 
 
 def maximum(x: Float[Array, "#rows"], mask: Mask) -> Float[Array, ""]:
-    """Maximum over the rows that exist, of numbers that are not negative."""
+    """Return the maximum of nonnegative numbers over the rows of present agents."""
     return x.max() if mask is None else jnp.where(mask, x, 0.0).max()
 
 
 def standardized(advantage: Float[Array, " rows"], mask: Mask) -> Float[Array, " rows"]:
-    """Advantages of a minibatch with mean 0 and sample standard deviation 1."""
+    """Return the advantages of a minibatch, standardized to mean 0 and sample standard deviation 1."""
     num_rows = advantage.size if mask is None else mask.sum()
     centered = advantage - mean(advantage, mask)
     variance = mean(jnp.square(centered), mask) * (num_rows / jnp.maximum(num_rows - 1, 1))
@@ -335,12 +385,15 @@ def standardized(advantage: Float[Array, " rows"], mask: Mask) -> Float[Array, "
 
 
 def squared_error(value: Float[Array, " rows"], target: Float[Array, " rows"], mask: Mask) -> Float[Array, ""]:
-    """Loss of the values."""
+    """Return the value loss, the mean squared error."""
     return mean(jnp.square(value - target), mask)
 
 
 def explained_variance(value: Float[Array, "*rows"], target: Float[Array, "*rows"], mask: Mask) -> Float[Array, ""]:
-    """1 for perfect values, 0 for a constant, negative for worse; NaN if there is nothing to explain."""
+    """Return 1 - Var(target - value) / Var(target).
+
+    It is 1 for perfect values, 0 for a constant, negative for worse values, and NaN if the targets have no variance.
+    """
 
     def variance(x: Array) -> Array:
         return mean(jnp.square(x - mean(x, mask)), mask)

@@ -1,4 +1,4 @@
-"""Proximal policy optimization with clipping (Schulman et al., 2017)."""
+"""Proximal policy optimization with a clipped surrogate (Schulman et al., 2017)."""
 
 from functools import partial
 from typing import Any
@@ -11,13 +11,18 @@ from jaxswarm import checks
 from jaxswarm.checks import require
 from jaxswarm.learners import on_policy
 from jaxswarm.learners.on_policy import LearnerState, Minibatch, OnPolicy, Params
+from jaxswarm.networks import Network
 from jaxswarm.rollout import Trajectory
 from jaxswarm.types import Key, Metrics, pytree
 
 
 @pytree
 class PPO(OnPolicy):
-    """Hyper-parameters of PPO, and the learner."""
+    """Proximal policy optimization with its hyperparameters; `OnPolicy` documents the inherited ones.
+
+    Attributes:
+        clip_range: The probability ratio is clipped to the range 1 - clip_range ... 1 + clip_range (clip_range > 0).
+    """
 
     clip_range: float = 0.2
 
@@ -26,21 +31,24 @@ class PPO(OnPolicy):
         require(self, checks.POSITIVE, "clip_range")
 
     def init(self, params: Params) -> LearnerState:
-        """State before the first update."""
+        """Return the state before the first update."""
         return LearnerState(params, on_policy.adam(self).init(params))
 
     def update(
-        self, key: Key, state: LearnerState, network: Any, task: Any, trajectory: Trajectory
+        self, key: Key, state: LearnerState, network: Network, task: Any, trajectory: Trajectory
     ) -> tuple[LearnerState, Metrics]:
-        """Learns from one trajectory, all epochs."""
+        """Update the parameters from one trajectory, in all epochs."""
 
         def loss(params: Params, batch: Minibatch) -> tuple[Array, Metrics]:
             return self.loss(network, params, batch)
 
         return on_policy.update(self, loss, key, state, network, task, trajectory)
 
-    def loss(self, network: Any, params: Params, batch: Minibatch) -> tuple[Float[Array, ""], Metrics]:
-        """Clipped surrogate, squared value error and entropy bonus of a minibatch; advantages are normalized in it."""
+    def loss(self, network: Network, params: Params, batch: Minibatch) -> tuple[Float[Array, ""], Metrics]:
+        """Return the clipped surrogate plus value loss minus entropy bonus, and metrics.
+
+        The advantages are standardized within the minibatch.
+        """
         policy, value = network.apply(params, batch.obs)
         mean = partial(on_policy.mean, mask=batch.obs.mask)
         log_ratio = policy.log_prob(batch.action) - batch.log_prob

@@ -30,6 +30,11 @@ Space = dict[str, Any]  # the choice for each key: a list of values or a range
 def load_space(name: str, config: Config) -> Space:
     """Load the search space of a file in `configs/search`, or at a path, for the aggregator of the config.
 
+    A file has `parameters: {key: choice}`, and `aggregator: {name: {key: choice}}` for choices that are added, or
+    replace others, for one aggregator. A choice is a list of values, or a range `{low: 1, high: 9}`, of integers if
+    both are integers, on a logarithmic scale with `log: true`; `step: 12` takes every twelfth number from `low`.
+    `layers: [least, most]` makes it a list of that many widths from the range, and `last` is the range of the last one.
+
     Raises a `ConfigError` for an unknown name or an invalid file.
     """
     shipped = {path.stem: path for path in (configs.config_dir() / configs.SEARCHES).glob("*.yaml")}
@@ -37,7 +42,7 @@ def load_space(name: str, config: Config) -> Space:
     if not path.is_file():
         raise ConfigError(f"search: must be one of {', '.join(sorted(shipped))}, or a YAML file, got {name!r}")
     content = configs.read(path)
-    if unknown := set(content) - {"parameters", "aggregator"}:
+    if unknown := set(content) - {"description", "parameters", "aggregator"}:
         raise ConfigError(f"{path}: keys must be parameters and aggregator, got {unknown.pop()!r}")
     parameters, of_aggregators = (content.get(part) or {} for part in ("parameters", "aggregator"))
     if not all(isinstance(x, dict) for x in (parameters, of_aggregators, *getattr(of_aggregators, "values", list)())):

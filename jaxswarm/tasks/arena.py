@@ -26,7 +26,7 @@ SETTLE_SUBSTEPS = 6  # substeps before an episode; they leave overlaps like the 
 
 @pytree
 class State:
-    """State of one environment."""
+    """State of one environment, drawn by `reset` and advanced by `step`."""
 
     position: Float[Array, "agents 2"]  # m
     heading: Float[Array, "agents"]  # rad, counter-clockwise from x

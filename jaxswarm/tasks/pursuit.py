@@ -26,7 +26,7 @@ WALL_LOW, WALL_HIGH = 1.0, 99.0  # agents beyond these are "at a wall" for every
 
 @pytree
 class State:
-    """State of one environment."""
+    """State of one environment, drawn by `reset` and advanced by `step`."""
 
     position: Float[Array, "agents 2"]  # world units, in [0, side]
     heading: Float[Array, "agents"]  # rad, counter-clockwise from x
@@ -114,7 +114,7 @@ class Pursuit:
 
     @property
     def motion(self) -> Velocity:
-        """Motion model of the agents."""
+        """Motion model of the agents: no inertia, at most one turn per second."""
         return Velocity(max_turn_rate=2 * math.pi)
 
     def reset(self, key: Key) -> State:

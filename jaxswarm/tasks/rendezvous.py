@@ -25,7 +25,7 @@ RELATIVE_VELOCITY = {
 
 @pytree
 class State:
-    """State of one environment."""
+    """State of one environment, drawn by `reset` and advanced by `step`."""
 
     position: Float[Array, "agents 2"]  # world units, in [0, side]
     heading: Float[Array, "agents"]  # rad, counter-clockwise from x
@@ -93,7 +93,7 @@ class Rendezvous:
 
     @property
     def motion(self) -> Acceleration | Velocity:
-        """Motion model that `dynamics` names."""
+        """Motion model of the agents, selected by `dynamics`."""
         return DYNAMICS[self.dynamics]()
 
     def reset(self, key: Key) -> State:

@@ -86,7 +86,7 @@ def others(view: View, agent: Int[Array, ""]) -> Int[Array, " others"]:
 
 
 def slots(view: View) -> Int[Array, "agents others"]:
-    """Return `others` for every agent."""
+    """Return the result of `others` for every agent, by row."""
     return jax.vmap(others, (None, 0))(view, jnp.arange(view.agents.position.shape[0]))
 
 
