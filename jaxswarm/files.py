@@ -1,10 +1,12 @@
 """Atomic writing of files, and reading and writing of `metrics.csv`."""
 
+import contextlib
 import csv
 import io
+import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,46 @@ def replace_bytes(path: Path, content: bytes) -> None:
     os.replace(temporary, path)
 
 
+def is_vacant(folder: Path) -> bool:
+    """Return whether a folder does not exist, is empty, or holds only temporary files of an interrupted write."""
+    return not folder.exists() or (folder.is_dir() and all(map(_is_temporary, folder.iterdir())))
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove temporary files that an interrupted write has left in a folder; no other process may write there."""
+    for path in filter(_is_temporary, folder.iterdir()):
+        path.unlink(missing_ok=True)
+
+
+def claim_folder(path: Path) -> Path:
+    """Create an empty folder of this name, with a number appended if the name is taken, and return its path.
+
+    Processes that claim the same name at the same time get different folders.
+    """
+    for number in itertools.count(1):
+        claimed = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        try:
+            claimed.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return claimed
+    raise AssertionError
+
+
+@contextlib.contextmanager
+def removed_if_empty(folder: Path) -> Iterator[None]:
+    """Remove the folder at the end if nothing was written into it."""
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # it holds files, or does not exist
+            folder.rmdir()
+
+
+def _is_temporary(path: Path) -> bool:
+    return path.is_file() and path.name.startswith(".") and path.suffix == ".tmp"
+
+
 def append_row(path: Path, row: Row) -> None:
     """Append a row to a CSV file and flush it to disk.
 
@@ -54,7 +96,7 @@ def read_rows(path: Path) -> list[Row]:
     """Read all complete rows. A truncated last line is skipped; a missing file has no rows."""
     if not path.exists():
         return []
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8-sig")  # with or without a byte order mark
     lines = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
     if not lines:
         return []

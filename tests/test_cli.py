@@ -150,13 +150,13 @@ def test_other_errors_are_not_hidden():
 def test_help_shows_groups_choices_and_keys(capsys):
     assert train.main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_envs: 32", "resume=PATH"))
+    assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_envs=32 ", "resume=PATH"))
     assert train.main(["task=pursuit_multi", "--help"]) == 0
     out = capsys.readouterr().out
     assert all(
-        part in out for part in ("keys of task=pursuit_multi", "task.num_evaders: 5", "learner.clip_range: 0.2 #")
+        part in out for part in ("keys of task=pursuit_multi", "task.num_evaders=5 ", "learner.clip_range=0.2 ")
     )
-    assert "task.num_evaders: 1" not in out
+    assert "task.num_evaders=1 " not in out
     assert train.main(["task=pursuits", "--help"]) == 2
     assert "did you mean 'pursuit'" in capsys.readouterr().err
     assert train.main(["--version"]) == 0
@@ -172,8 +172,8 @@ def test_what_users_registered_has_help(tmp_path, monkeypatch, capsys):
     with mock.patch.dict(jaxswarm.TASKS):
         assert train.main([f"imports={tmp_path / 'mine.py'}", "task=again", "--help"]) == 0
     out = capsys.readouterr().out
-    assert "task=again " in out
-    assert "task.num_evaders: 1\n" in out
+    assert "task=again" in out
+    assert "task.num_evaders=1 " in out
 
 
 def test_a_larger_swarm_begins_with_the_policy_of_a_smaller_one(finished, tmp_path, monkeypatch, capsys):
@@ -340,7 +340,7 @@ def test_killed_and_terminated_runs_resume_to_the_undisturbed_end(tmp_path, monk
     assert train.main([*overrides, f"run_dir={undisturbed}"]) == 0
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     process = start(*overrides, f"run_dir={run_dir}")
-    for num_rows, number, code in ((30, signal.SIGKILL, -9), (80, signal.SIGKILL, -9), (130, signal.SIGTERM, 0)):
+    for num_rows, number, code in ((30, signal.SIGKILL, -9), (80, signal.SIGKILL, -9), (130, signal.SIGTERM, 143)):
         wait_for_rows(process, run_dir, num_rows)
         process.send_signal(number)
         out, err = process.communicate(timeout=120)

@@ -128,7 +128,7 @@ def test_a_run_of_0_1_is_plotted(run_dir, tmp_path):
 def test_a_run_of_0_1_resumes_with_the_recorded_returns(few_optimizations, run_dir):
     assert train.main([f"resume={run_dir}", "num_updates=7"]) == 0
     rows = files.read_rows(run_dir / "metrics.csv")
-    assert [row["update"] for row in rows] == [0, 3, 4, 6, 7]
+    assert [row["update"] for row in rows] == [0, 3, 6, 7]
     assert [row["eval/return"] for row in rows[-2:]] == pytest.approx([-1.438514, -1.9802207], abs=1e-4)
     assert "num_envs: 2" in (run_dir / "config.yaml").read_text()
 

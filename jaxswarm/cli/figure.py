@@ -70,6 +70,7 @@ def _run(
     arguments: Sequence[str], directory: Path, out: Path, options: dict[str, str], overrides: Sequence[str]
 ) -> int:
     from jaxswarm.figures import figure as figures  # noqa: PLC0415
+    from jaxswarm.host import signals  # noqa: PLC0415
 
     figure = figures.load_figure(arguments[0])
     if any(word.startswith("num_seeds=") for word in overrides):
@@ -79,7 +80,7 @@ def _run(
     runs = figures.plan(figure, directory, figures.find_runs(directory), num_seeds, scale, overrides)
     if not _train({series: runs[series] for series in chosen}):
         print(f"stopped; resume with: {command('jaxswarm-figure', *arguments)}")
-        return 0
+        return signals.exit_code()
     section = _section(figure, runs, figures.find_runs(directory), out, overrides)
     replace_text(out / f"{figure.name}.md", section)
     print(f"\n{section}\nwrote {out / f'{figure.name}.md'}")

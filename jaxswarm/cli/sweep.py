@@ -10,6 +10,7 @@ from jaxswarm import config as configs
 from jaxswarm.cli import plot
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
+from jaxswarm.files import claim_folder, is_vacant, removed_if_empty
 
 HELP = """\
 jaxswarm-sweep key=a,b,c [key=1e-4..1e-3:5log] ... [num_seeds=N] [sweep_dir=PATH]
@@ -56,18 +57,20 @@ def main(arguments: Sequence[str]) -> int:
         sweep_dir = Path(options["resume"])
         options, overrides = _load(sweep_dir)
     else:
-        sweep_dir = Path(options.pop("sweep_dir", "") or f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}")
-        if sweep_dir.exists() and (not sweep_dir.is_dir() or any(sweep_dir.iterdir())):
+        given = options.pop("sweep_dir", "")
+        sweep_dir = Path(given) if given else claim_folder(Path(f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}"))
+        if not is_vacant(sweep_dir):
             raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; resume it with resume={sweep_dir}")
-    if "search" in options:
-        return _search(sweep_dir, options, overrides)
-    if options:
-        raise ConfigError(f"{next(iter(options))}: must be used with search=NAME")
-    return _sweep(sweep_dir, overrides)
+    with removed_if_empty(sweep_dir):
+        if "search" in options:
+            return _search(sweep_dir, options, overrides)
+        if options:
+            raise ConfigError(f"{next(iter(options))}: must be used with search=NAME")
+        return _sweep(sweep_dir, overrides)
 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
     from jaxswarm.studies import grid  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
 
@@ -85,7 +88,7 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
         is_finished, of_each = train(together)
         if not is_finished:
             print(f"stopped; resume with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
-            return 0
+            return signals.exit_code()
         rows |= {run.run_dir: x for run, x in zip(together, of_each, strict=True)}
     table = grid.summary(runs, [rows[run.run_dir] for run in runs])
     grid.write_summary(sweep_dir / "summary.csv", table)
@@ -97,7 +100,7 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
 
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
     from jaxswarm.studies import search  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
@@ -122,7 +125,7 @@ def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) 
         if not is_finished:
             search.requeue(study, asked.number)
             print(f"stopped; resume with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
-            return 0
+            return signals.exit_code()
         search.tell(study, asked, search.value(rows, run.seeds, run.num_evaluations))
     done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
     for trial in sorted(done, key=lambda trial: trial.value or 0.0, reverse=True)[:5]:

@@ -23,6 +23,7 @@ from jaxswarm.cli.program import (
     wants_help,
 )
 from jaxswarm.config import Config, ConfigError
+from jaxswarm.files import claim_folder, is_vacant, removed_if_empty
 
 HELP = """\
 jaxswarm-train [group=choice | key=value] ... [run_dir=PATH]
@@ -63,8 +64,14 @@ def _train(arguments: Sequence[str], is_first: bool) -> int:
             raise ConfigError("give only one of run_dir and resume")
         return _resume(Path(paths["resume"]), overrides, is_first)
     config = configs.compose(overrides)
-    run_dir = Path(paths.get("run_dir") or _default_run_dir(config))
-    if is_first and run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+    if "run_dir" not in paths:
+        configs.build(config)  # raises before a folder is created
+        name = Path(_default_run_dir(config))
+        run_dir = claim_folder(name) if is_first else name
+        with removed_if_empty(run_dir):
+            return _fit(config, run_dir, is_resumed=False, is_first=is_first)
+    run_dir = Path(paths["run_dir"])
+    if is_first and not is_vacant(run_dir):
         hint = f"resume it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
         raise ConfigError(f"run_dir={run_dir} exists and is not empty; {hint}, or choose another folder")
     return _fit(config, run_dir, is_resumed=False, is_first=is_first)
@@ -86,7 +93,7 @@ def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
 
 def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int:
     use_compile_cache()
-    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
     from jaxswarm.host.checkpoint import CheckpointError  # noqa: PLC0415
     from jaxswarm.host.fit import DivergedError, fit_runs  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
@@ -102,7 +109,7 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     update = int(train_state.update.max())
     if update < run.num_updates:
         print(f"stopped after update {update} of {run.num_updates}; resume with: {resume_command(run_dir)}")
-        return 0
+        return signals.exit_code()
     if is_first:
         _write_replay(config, run, update)
     if rows:
@@ -133,11 +140,7 @@ def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
 
 def _default_run_dir(config: Config) -> str:
     names = "-".join(config[part]["name"] for part in ("task", "aggregator", "learner"))
-    path = base = f"runs/{names}-{time.strftime('%Y%m%d-%H%M%S')}"
-    number = 2
-    while Path(path).exists():
-        path, number = f"{base}-{number}", number + 1
-    return path
+    return f"runs/{names}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _summary(config: Config, run: Any) -> str:

@@ -21,8 +21,8 @@ import numpy as np
 
 from jaxswarm import config as configs
 from jaxswarm import files, render
-from jaxswarm.config import ConfigError, RunSettings, plugins
-from jaxswarm.files import Row, replace_text
+from jaxswarm.config import ConfigError, RunSettings
+from jaxswarm.files import Row
 from jaxswarm.host import ensemble, loggers, trained
 from jaxswarm.host.batch_recorder import BatchRecorder, Chunk, DivergedError
 from jaxswarm.host.checkpoint import Restored, restore, set_aside_after
@@ -153,8 +153,6 @@ def _fit(runs: Sequence[Run], resume: bool, progress: bool) -> tuple[TrainState,
         return _concatenate(restored), [_finished_rows(run) for run in runs]
     batch = ensemble.make_batch([run.experiment for run in runs], len(runs[0].seeds))
     runs = runs if is_first else [dataclasses.replace(run, run_dir=None, on_evaluation=None) for run in runs]
-    for run in runs:
-        _write_config(run)
     start = restored[0].update if restored else 0
     agent_steps = runs[0].experiment.agent_steps_per_update * batch.num_runs
     with Progress(start, num_updates, agent_steps, progress and is_first) as shown, stop_requests() as stop:
@@ -168,13 +166,6 @@ def _fit(runs: Sequence[Run], resume: bool, progress: bool) -> tuple[TrainState,
             for one in recorders:
                 one.close()
     return states, [one.rows for one in recorders]
-
-
-def _write_config(run: Run) -> None:
-    """Write the run's config, and copies of the user's files that it names, into the folder."""
-    if run.run_dir and run.config is not None:
-        replace_text(run.run_dir / "config.yaml", configs.dump(dict(run.config)))
-        plugins.keep(run.config.get("imports", []), run.run_dir)
 
 
 def _initial(batch: RunBatch, runs: Sequence[Run]) -> TrainState:

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxswarm import config as configs
 from jaxswarm import files
 from jaxswarm.analysis import training_curve
+from jaxswarm.config import plugins
 from jaxswarm.files import RETURN, Row
 from jaxswarm.host import manifest
 from jaxswarm.host.checkpoint import Checkpoints, Restored
@@ -50,7 +52,10 @@ class Recorder:
         """Prepare the run folder, once the first chunk has been compiled and dispatched."""
         run, run_dir = self.run, self.run.run_dir
         if run_dir:
-            run_dir.mkdir(parents=True, exist_ok=True)
+            files.remove_temporary_files(run_dir)
+            if run.config is not None:
+                files.replace_text(run_dir / "config.yaml", configs.dump(dict(run.config)))
+                plugins.keep(run.config.get("imports", []), run_dir)
             content = manifest.describe(run.experiment, run.num_updates, run.seeds)
             manifest.write_manifest(run_dir / "manifest.json", content)
             self.rows = files.keep_rows_before(run_dir / "metrics.csv", self._start)

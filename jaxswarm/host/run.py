@@ -69,7 +69,8 @@ class Run:
 def locked(run_dir: Path) -> Iterator[None]:
     """Hold the folder's lock, so that no other process trains into it; a `ConfigError` if another process holds it.
 
-    The system releases the lock when the process ends. Without support for file locks, this does nothing.
+    Creates the folder, and removes it at the end if it is empty. The system releases the lock when the process ends.
+    Without support for file locks, nothing is locked.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
@@ -83,7 +84,8 @@ def locked(run_dir: Path) -> Iterator[None]:
             raise ConfigError(f"{run_dir} is being trained by another process; wait for it, or stop it") from None
         except (ImportError, OSError):
             pass
-        yield
+        with files.removed_if_empty(run_dir):
+            yield
 
 
 def has_checkpoint(run_dir: Path) -> bool:

@@ -8,6 +8,13 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+_received: list[int] = []  # signals of the latest `stop_requests`
+
+
+def exit_code() -> int:
+    """Return the exit code after the latest training: 128 + the number of the signal that stopped it, or 0."""
+    return 128 + _received[0] if _received else 0
+
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[threading.Event]:
@@ -16,6 +23,7 @@ def stop_requests() -> Iterator[threading.Event]:
     Outside of the main thread, which alone may handle signals, the event is never set.
     """
     stop = threading.Event()
+    _received.clear()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
@@ -23,6 +31,7 @@ def stop_requests() -> Iterator[threading.Event]:
 
     def request(number: int, _: Any) -> None:
         stop.set()
+        _received.append(number)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         text = f"\n{signal.Signals(number).name}: finishing the current updates (Ctrl-C to abort)\n"
         os.write(sys.stderr.fileno(), text.encode())  # the signal may have interrupted a print
