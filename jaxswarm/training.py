@@ -180,7 +180,7 @@ def is_loss(name: str) -> bool:
 
 
 def _evaluate_if(is_due: Bool[Array, ""], experiment: Experiment, state: TrainState) -> Metrics:
-    """Evaluate, or return NaN. This is a loop of at most one pass, because `vmap` executes both branches of a `cond`."""
+    """Evaluate if due, else return NaN; a loop of at most one pass, as `vmap` runs both branches of a `cond`."""
     shapes = jax.eval_shape(evaluate, experiment, state)
     skipped = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
 

@@ -153,9 +153,7 @@ def test_help_shows_groups_choices_and_keys(capsys):
     assert all(part in out for part in ("task=rendezvous", "learner=ppo_thesis", "num_envs=32 ", "resume=PATH"))
     assert train.main(["task=pursuit_multi", "--help"]) == 0
     out = capsys.readouterr().out
-    assert all(
-        part in out for part in ("keys of task=pursuit_multi", "task.num_evaders=5 ", "learner.clip_range=0.2 ")
-    )
+    assert all(part in out for part in ("keys of task=pursuit_multi", "task.num_evaders=5 ", "learner.clip_range=0.2 "))
     assert "task.num_evaders=1 " not in out
     assert train.main(["task=pursuits", "--help"]) == 2
     assert "did you mean 'pursuit'" in capsys.readouterr().err

@@ -355,5 +355,13 @@ def test_what_aggregators_cannot_share_is_said_before_training():
 
 
 def test_imports_are_names():
-    with pytest.raises(ConfigError, match=r"imports: must be .*, got 3"):
+    with pytest.raises(ConfigError, match="cannot import 3"):
         configs.compose(["imports=3"])
+
+
+@pytest.mark.parametrize("name", ["läufe", "lr=0.1", "run(1)", "a,b", "C#", "a~b", "实验"])
+def test_paths_are_taken_literally(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert configs.compose([f"init_from={name}/base"])["init_from"] == str(tmp_path / name / "base")
+    (tmp_path / f"{name}.py").write_text("import jaxswarm\n")
+    assert configs.compose([f"imports={name}.py"])["imports"] == [str(tmp_path / f"{name}.py")]

@@ -484,7 +484,7 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}
     assert len(folders) == 2
     assert {"fig_6_15.png", "fig_6_15.csv", "fig_6_15.md"} <= {path.name for path in tmp_path.iterdir()}
-    monkeypatch.setattr(experiments, "names", lambda: ["fig_6_5", "fig_6_15"])
+    monkeypatch.setattr(figures, "names", lambda: ["fig_6_5", "fig_6_15"])
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}", *TINY]) == 0
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| Bayesian agg. | 2 | 0.0 |" in report  # from the run of the other figure

@@ -54,3 +54,33 @@ def test_removing_all_rows_removes_the_columns_too(path):
 def test_no_file_has_no_rows(tmp_path):
     assert files.read_rows(tmp_path / "none.csv") == []
     assert files.keep_rows_before(tmp_path / "none.csv", 5) == []
+
+
+def test_a_byte_order_mark_is_skipped(path):
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert [row["update"] for row in files.read_rows(path)] == [0, 5, 10]
+
+
+def test_folders_of_one_name_are_claimed_once(tmp_path):
+    claimed = [files.claim_folder(tmp_path / "runs" / "a") for _ in range(3)]
+    assert [folder.name for folder in claimed] == ["a", "a-2", "a-3"]
+
+
+def test_temporary_files_of_an_interrupted_write_do_not_fill_a_folder(tmp_path):
+    assert files.is_vacant(tmp_path / "missing")
+    (tmp_path / ".config.yaml.123.tmp").write_text("half")
+    assert files.is_vacant(tmp_path)
+    (tmp_path / "config.yaml").write_text("")
+    assert not files.is_vacant(tmp_path)
+    files.remove_temporary_files(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["config.yaml"]
+    assert not files.is_vacant(tmp_path / "config.yaml")
+
+
+def test_a_folder_without_results_is_removed(tmp_path):
+    for name, content in (("empty", None), ("full", "x")):
+        with files.removed_if_empty(tmp_path / name):
+            (tmp_path / name).mkdir()
+            if content:
+                (tmp_path / name / "file").write_text(content)
+    assert [folder.name for folder in tmp_path.iterdir()] == ["full"]

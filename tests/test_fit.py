@@ -329,3 +329,23 @@ def test_a_return_that_is_no_number_stops_the_run_and_is_named():
     experiment = EXPERIMENT.replace(task=Unrewarded(num_agents=3, episode_length=5))
     with pytest.raises(DivergedError, match="eval/return is nan at update 0"):
         fit(experiment, NUM_UPDATES, progress=False)
+
+
+def test_a_plot_that_fails_is_one_warning(tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise OSError("no fonts")
+
+    monkeypatch.setattr(recorder.training_curve, "draw_curve", fail)
+    for name in ("first", "second"):
+        fit(EXPERIMENT, 1, run_dir=tmp_path / name, **OPTIONS)
+    assert capsys.readouterr().err == "warning: no curve.png: OSError: no fonts\n"
+
+
+def test_a_run_that_fails_before_its_first_update_leaves_no_folder(tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no program")
+
+    monkeypatch.setattr(ensemble, "compile_batch", fail)
+    with pytest.raises(RuntimeError, match="no program"):
+        fit(EXPERIMENT, 1, run_dir=tmp_path / "run", **OPTIONS)
+    assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 LEVELS = [
-    {"types", "checks", "scene", "files", "config.schema", "config.renamed"},
+    {"types", "checks", "plot_settings", "scene", "files", "config.schema", "config.renamed"},
     {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "export.program"},
     {"config.plugins", "config.settings", "config.overrides"},
     {"physics.dynamics", "physics.neighbors", "physics.collisions", "aggregators.monoids", "aggregators.attentive"},

@@ -1,5 +1,11 @@
 """Progress display in logs and in notebooks."""
 
+import io
+import re
+import sys
+
+import pytest
+
 from jaxswarm.host.progress import Progress
 
 
@@ -30,3 +36,33 @@ def test_notebooks_without_widgets_get_lines(capsys, monkeypatch):
     with Progress(0, 2, 500) as progress:
         progress.advance(2, 1.0)
     assert capsys.readouterr().out.splitlines()[-1].startswith("update 2/2 · return 1.0")
+
+
+class Terminal(io.StringIO):
+    """A terminal that records what is written to it."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("columns", "is_wide"), [("40", False), ("100", True)])
+def test_a_narrow_terminal_shows_update_and_return(monkeypatch, columns, is_wide):
+    monkeypatch.setattr(sys, "stdout", terminal := Terminal())
+    monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setenv("TERM", "xterm")
+    with Progress(0, 3000, 500) as progress:
+        progress.advance(1500, -33.3)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    assert re.search(r"update 1500/3000.*return -33.3", text)
+    assert ("left" in text) == is_wide
+
+
+@pytest.mark.parametrize("environment", [{"TERM": "dumb"}, {"FORCE_COLOR": "1", "TERM": "xterm"}])
+def test_dumb_terminals_and_files_get_lines(monkeypatch, environment):
+    stream = Terminal() if environment["TERM"] == "dumb" else io.StringIO()
+    monkeypatch.setattr(sys, "stdout", stream)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with Progress(0, 2, 500) as progress:
+        progress.advance(2, 1.0)
+    assert stream.getvalue().startswith("compiling ...\nupdate 2/2 · return 1.0 · ")

@@ -27,3 +27,15 @@ def test_the_curve_of_several_seeds_shows_their_median(tmp_path):
     assert text.count("stroke-width: 0.6;") == 3
     training_curve.draw_curve(tmp_path / "curve.svg", rows[::3], "one")
     assert "mean ± std" in (tmp_path / "curve.svg").read_text()
+
+
+def test_the_users_settings_of_matplotlib_have_no_influence(tmp_path, monkeypatch):
+    import matplotlib as mpl  # noqa: PLC0415
+
+    rows = [make_row(i) for i in range(3)]
+    training_curve.draw_curve(tmp_path / "ours.svg", rows, "title")
+    monkeypatch.setitem(mpl.rcParams, "lines.linewidth", 9.0)
+    monkeypatch.setitem(mpl.rcParams, "text.usetex", True)
+    training_curve.draw_curve(tmp_path / "theirs.svg", rows, "title")
+    assert (tmp_path / "ours.svg").read_bytes() == (tmp_path / "theirs.svg").read_bytes()
+    assert mpl.rcParams["lines.linewidth"] == 9.0

@@ -354,8 +354,8 @@ class Pool(nn.Module):
     def segments(self, groups: tuple[Entities, ...], own: Array | None) -> Float[Array, "receivers out"]:
         """Aggregate all slots as one list by segment operations."""
         view = self._encode(groups, own)
-        messages = view.messages.reshape(-1, view.messages.shape[-1])
-        return aggregate(self.aggregator, messages, dataclasses.replace(segments_of(view.mask), own=own))
+        segments = dataclasses.replace(segments_of(view.mask), own=own)
+        return aggregate(self.aggregator, view.messages.reshape(-1, view.messages.shape[-1]), segments)
 
     def _encode(self, groups: tuple[Entities, ...], own: Array | None) -> DenseView:
         def encode(encoder: EntityEncoder, group: Entities) -> Array:

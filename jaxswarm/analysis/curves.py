@@ -84,7 +84,7 @@ def read_lines(path: Path) -> dict[str, Line]:
     `ValueError` that names the fault of an invalid file.
     """
     try:
-        with open(path, encoding="utf-8", newline="") as file:
+        with open(path, encoding="utf-8-sig", newline="") as file:
             rows = list(csv.DictReader(file))
     except csv.Error as error:
         raise ValueError(str(error)) from error

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxswarm.analysis.curves import Curve, Line, Points
+from jaxswarm.plot_settings import plot_settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,10 +75,9 @@ class Plot:
 
 def draw(path: Path, plot: Plot) -> None:
     """Draw the plot into a file, whose suffix is one of `FORMATS`. The file is written completely or not at all."""
-    from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    with rc_context(rc=SETTINGS):
+    with plot_settings(SETTINGS):
         figure = Figure(figsize=(7, 4.4), layout="constrained")
         axes = figure.subplots()
         scaled = _in_units(plot)

@@ -1,5 +1,6 @@
 """Shared parts of the command line programs: options and overrides, exit codes, one line for each user error."""
 
+import contextlib
 import functools
 import gc
 import importlib.metadata
@@ -26,6 +27,7 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
         gc.set_threshold(
             200_000
         )  # imports and tracing make many objects and little garbage; this saves a tenth of the start-up time
+        _isolate()
         try:
             arguments = sys.argv[1:] if arguments is None else arguments
             code = _print_version() if list(arguments) == ["--version"] else main(arguments)
@@ -52,6 +54,15 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
             return 1
 
     return program
+
+
+def _isolate() -> None:
+    """Keep settings of the surroundings, as inherited from a notebook or a terminal, from ending a program."""
+    os.environ["MPLBACKEND"] = "agg"
+    os.environ.pop("JAX_ENABLE_X64", None)  # programs compute in single precision
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, ValueError):  # not a stream of the system
+            stream.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _print_version() -> int:

@@ -6,6 +6,8 @@ from typing import Any
 
 from jaxswarm.config.schema import ConfigError
 
+PATHS = ("init_from", "imports")  # keys whose values are paths
+
 
 def parse(overrides: Sequence[str]) -> list[tuple[str, Any]]:
     """Return the keys and values of `key=value` overrides; raises a `ConfigError` if one has several values."""
@@ -25,7 +27,10 @@ def combinations(overrides: Sequence[str]) -> list[list[tuple[str, Any]]]:
 
 
 def _parse(text: str) -> tuple[str, list[Any]]:
-    """Return the key and the values of one override."""
+    """Return the key and the values of one override; paths are taken literally, whatever characters they contain."""
+    key, _, value = text.partition("=")
+    if key in PATHS and value and value != "null" and not value.startswith("["):
+        return key, [value]
     from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
     from hydra.core.override_parser.types import OverrideType  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415

@@ -2,10 +2,12 @@
 
 import importlib.util
 import math
+import sys
 import time
 from typing import Any
 
 SECONDS_BETWEEN_LINES = 10.0  # without a terminal
+NARROW = 72  # columns below which a terminal shows only the update and the return
 
 
 class Progress:
@@ -75,15 +77,19 @@ class Progress:
         screen = console.Console()
         # Without ipywidgets, rich warns and its bar does not move in notebooks.
         is_bare = screen.is_jupyter and importlib.util.find_spec("ipywidgets") is None
-        if is_bare or not (screen.is_terminal or screen.is_jupyter):
+        is_terminal = sys.stdout.isatty() and not screen.is_dumb_terminal  # rich trusts FORCE_COLOR, also for files
+        if is_bare or not (is_terminal or screen.is_jupyter):
             return None
-        columns = (
+        essential = (
             progress.TextColumn("update {task.completed}/{task.total}"),
-            progress.BarColumn(bar_width=None),
             progress.TextColumn("{task.fields[evaluation]}", style="bold"),
+        )
+        rest = (
+            progress.BarColumn(bar_width=None),
             progress.TextColumn("{task.fields[rate]}"),
             progress.TextColumn("{task.fields[left]}"),
         )
+        columns = essential if screen.width < NARROW else essential + rest
         bar = progress.Progress(*columns, console=screen, refresh_per_second=4, expand=True)
         fields: Any = {"rate": "compiling", "evaluation": "return -", "left": "-:-- left"}
         self._task = bar.add_task("", total=self._num_updates, completed=self._update, **fields)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -20,6 +21,8 @@ from jaxswarm.host.run import Run
 from jaxswarm.training import TrainState, is_loss
 
 SECONDS_PER_CURVE = 60.0  # between two plots of the learning curve during training
+
+_warned: set[str] = set()  # warnings about plots, printed once per process
 
 
 @dataclasses.dataclass
@@ -183,10 +186,16 @@ class Recorder:
 
 
 def plot_curve(run: Run, rows: Sequence[Row]) -> None:
-    """Plot the learning curve of a run into its folder."""
+    """Plot the learning curve of a run into its folder; a plot that fails never ends training."""
     assert run.run_dir
     title = f"{type(run.experiment.task).__name__}, {run.experiment.task.num_agents} agents"
-    training_curve.draw_curve(run.run_dir / "curve.png", rows, title)
+    try:
+        training_curve.draw_curve(run.run_dir / "curve.png", rows, title)
+    except Exception as error:  # plotting depends on the user's fonts, files and libraries
+        message = f"no curve.png: {type(error).__name__}: {error}"
+        if message not in _warned:
+            print(f"warning: {message}", file=sys.stderr)
+            _warned.add(message)
 
 
 def _reason(metrics: dict[str, Any], update: int) -> str:

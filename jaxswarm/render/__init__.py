@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 
+from jaxswarm.plot_settings import plot_settings
 from jaxswarm.render import page, pictures
 from jaxswarm.render.film import MAX_SHARES, Film, record
 from jaxswarm.render.pictures import RenderError
@@ -73,7 +74,8 @@ def write(path: str | Path, films: Sequence[Film], **options: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
-        FORMATS[path.suffix.lower()](temporary, films, **options)
+        with plot_settings():
+            FORMATS[path.suffix.lower()](temporary, films, **options)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
