@@ -34,6 +34,11 @@ def replace_bytes(path: Path, content: bytes) -> None:
     os.replace(temporary, path)
 
 
+def read_text(path: Path) -> str:
+    """Return the content of a text file, with or without a byte order mark; a missing file is empty."""
+    return path.read_text(encoding="utf-8-sig") if path.exists() else ""
+
+
 def is_vacant(folder: Path) -> bool:
     """Return whether a folder does not exist, is empty, or holds only temporary files of an interrupted write."""
     return not folder.exists() or (folder.is_dir() and all(map(_is_temporary, folder.iterdir())))
@@ -94,9 +99,7 @@ def append_row(path: Path, row: Row) -> None:
 
 def read_rows(path: Path) -> list[Row]:
     """Read all complete rows. A truncated last line is skipped; a missing file has no rows."""
-    if not path.exists():
-        return []
-    text = path.read_text(encoding="utf-8-sig")  # with or without a byte order mark
+    text = read_text(path)
     lines = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
     if not lines:
         return []

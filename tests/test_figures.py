@@ -16,6 +16,7 @@ from jaxswarm.analysis.curves import Curve, Line
 from jaxswarm.cli import figure as program
 from jaxswarm.config import ConfigError
 from jaxswarm.figures import figure as figures
+from jaxswarm.figures import report
 from jaxswarm.figures.claims import KINDS, Claim, Measured, judge
 from jaxswarm.studies import execution
 
@@ -422,6 +423,12 @@ def test_folders_of_no_figure_are_told(trained, tmp_path, capsys):
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
     assert (tmp_path / "out" / "report.md").read_text() == report
     assert capsys.readouterr().err == ""
+
+
+def test_finished_sections_of_an_earlier_report_stay():
+    sections = ["## a: One\n\nDone.\n", f"## b: Two\n\n{report.NOT_RUN}\n", "## c: Three\n\n| x |\n"]
+    found = report.finished_sections(report.page(sections, []))
+    assert found == {"a": sections[0], "c": sections[2]}
 
 
 def test_what_is_kept_of_a_run_is_all_that_reports_read(trained, tmp_path):

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxswarm import files
 from jaxswarm.cli.help import figures_help
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError
@@ -14,12 +15,13 @@ from jaxswarm.files import replace_text
 
 HELP = """\
 jaxswarm-figure FIGURE [seeds=N] [scale=1.0] [series=PATTERN] [dir=runs/figures] [out=PATH] [key=value ...]
-jaxswarm-figure all [dir=runs/figures] [out=benchmarks/results] [key=value ...]
+jaxswarm-figure all [dir=runs/figures] [out=PATH] [key=value ...]
 
 The first form trains all series of a figure of the thesis with the published settings. It writes the figure with the
 thesis's curves overlaid, a table, and a verdict on each claim of the figure. The same command resumes after Ctrl-C.
 Figures share run folders where their series are the same. The second form trains nothing: it reports all finished runs
-and copies their evaluations to out/runs, where later reports find the runs that are not in dir.
+and copies their evaluations to out/runs, where later reports find the runs that are not in dir. Sections of an earlier
+report stay if no run of their figure is found.
 
 options
   seeds=N          Seeds of each series. The default is the number that verdicts need. A larger number later trains
@@ -27,7 +29,7 @@ options
   scale=0.1        Train this share of the updates. Verdicts then say that the runs were cut. A larger scale resumes.
   series=PATTERN   Train only series that match the pattern, with * for anything: series='Mean*'.
   dir=PATH         Folder of the run folders (default: runs/figures).
-  out=PATH         Folder of plots and reports (default: dir; for all: benchmarks/results).
+  out=PATH         Folder of plots and reports (default: dir).
   key=value        A key of jaxswarm-train for every series. Runs with other keys have folders of their own.
 
 examples
@@ -49,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     if name == "all" and {"seeds", "scale", "series"} & options.keys():
         raise ConfigError("seeds, scale and series: must be used with one figure; all trains nothing")
     directory = Path(options.get("dir", "runs/figures"))
-    out = Path(options.get("out", "benchmarks/results" if name == "all" else directory))
+    out = Path(options.get("out", directory))
     try:
         if name == "all":
             return _report_all(directory, out, overrides)
@@ -95,9 +97,14 @@ def _report_all(directory: Path, out: Path, overrides: Sequence[str]) -> int:
     found, sections, used = figures.find_runs(directory, kept), [], set()
     if not found:
         raise ConfigError(f"dir: {directory} holds no run folder; train a figure first, or give the folder of its runs")
+    earlier = report.finished_sections(files.read_text(out / "report.md"))
     for figure in map(figures.load_figure, figures.names()):
         runs = figures.plan(figure, directory, found, overrides=overrides)
-        sections.append(_section(figure, runs, found, out, overrides))
+        section = _section(figure, runs, found, out, overrides)
+        if figure.name in earlier and report.NOT_RUN in section:
+            section = earlier[figure.name]
+            print(f"{figure.name}: no run found, its section of the earlier report stays", file=sys.stderr)
+        sections.append(section)
         configs_of_series = [run.config for run, *_ in runs.values()]
         used |= {folder.path for folder in found if any(figures.matches(folder, x) for x in configs_of_series)}
     for folder in found:

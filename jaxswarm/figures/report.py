@@ -7,6 +7,7 @@ from jaxswarm.figures.claims import Measured, Verdict
 from jaxswarm.figures.figure import FRACTIONS, Figure, thesis_measured, verdicts
 from jaxswarm.host.run import Run
 
+NOT_RUN = "This figure was not run."
 HEAD = """\
 # Reproduced figures of the thesis
 
@@ -29,13 +30,19 @@ def page(sections: Sequence[str], origins: Sequence[tuple[str, str]]) -> str:
     return "\n".join([HEAD, *lines, *sections])
 
 
+def finished_sections(page: str) -> dict[str, str]:
+    """Return the sections of a report by figure name, without those of figures that were not run."""
+    parts = [f"## {part}" for part in page.split("\n## ")[1:]]
+    return {part[3 : part.index(":")]: part.rstrip("\n") + "\n" for part in parts if NOT_RUN not in part}
+
+
 def section(
     figure: Figure, runs: Mapping[str, Sequence[Run]], measured: Mapping[str, Measured], overrides: Sequence[str]
 ) -> str:
     """Return the section of one figure: its plots, a table of its series, and the verdicts."""
     title = f"## {figure.name}: {figure.title}\n\n"
     if not measured:
-        return f"{title}This figure was not run.\n"
+        return f"{title}{NOT_RUN}\n"
     images = [f"![{figure.title}]({name}.png)" for name in figure.pictures]
     changed = [f"These overrides differ from the thesis: {' '.join(overrides)}."] if overrides else []
     tables = [_table(figure, runs, measured), *([_verdicts(figure, measured)] if figure.claims else [])]
