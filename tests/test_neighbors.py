@@ -1,4 +1,4 @@
-"""Neighbors found through a grid of cells are those found among all pairs."""
+"""The grid of cells finds the same neighbors as the search over all pairs."""
 
 import functools
 
@@ -33,7 +33,7 @@ def distances(torus, position):
 
 
 def random_swarm(seed):
-    """Spread out, or in clusters, some of them coincident or on a side; most radii are not those of cells."""
+    """Draw a swarm that is spread out or in clusters, with coincident agents and agents on the sides, and a radius."""
     rng = np.random.default_rng(seed)
     position = rng.random((ROOM, 2)) * SIDE
     position = position[rng.integers(0, rng.integers(1, ROOM + 1), ROOM)] + rng.choice([0, 0.3]) * rng.random((ROOM, 2))

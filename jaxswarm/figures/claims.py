@@ -29,7 +29,7 @@ class Measured:
 
     @property
     def is_cut(self) -> bool:
-        """Whether the series ends before `end`."""
+        """Return whether the series ends before `end`."""
         return self.is_cut_before(self.end)
 
     @property

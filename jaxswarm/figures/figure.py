@@ -204,9 +204,9 @@ def plot_figure(figure: Figure, measured: Mapping[str, Measured], out: Path) -> 
     written = []
     for name, log in figure.pictures.items():
         label = "return of an episode"
-        picture = Plot("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
-        plots.draw(out / f"{name}.png", picture)
-        replace_text(out / f"{figure.name}.csv", plots.table(picture))
+        plot = Plot("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
+        plots.draw(out / f"{name}.png", plot)
+        replace_text(out / f"{figure.name}.csv", plots.table(plot))
         written.append(out / f"{name}.png")
     return [*written, out / f"{figure.name}.csv"]
 

@@ -28,7 +28,7 @@ class Logger(Protocol):
         ...
 
     def close(self) -> None:
-        """Returns when all is written."""
+        """Wait until all rows are written, and close the logger."""
         ...
 
 

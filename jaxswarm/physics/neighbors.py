@@ -1,7 +1,8 @@
-"""Who is near whom: between all pairs of a swarm, or through a grid of cells.
+"""Neighbor search: over all pairs of a swarm, or through a grid of cells.
 
-The grid takes O(agents) memory. Its time grows with the agents times those in the fullest cells, which are as wide as
-agents see: it is faster than all pairs only if that is a small part of the world and the swarm is spread out.
+The grid needs O(agents) memory. Its cells are as wide as the visibility radius, and its time grows with the number of
+agents times the number in the fullest cells. It is faster than all pairs only if the radius is a small part of the
+world and the swarm is spread out.
 """
 
 import itertools
@@ -15,16 +16,16 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxswarm.physics.geometry import Space, Torus, norm
 from jaxswarm.types import pytree
 
-IsVisible = Callable[[Array], Array]  # of distances; never true beyond the radius
+IsVisible = Callable[[Array], Array]  # of distances; must be false beyond the radius
 
 
 @pytree
 class Neighborhood:
-    """What surrounds each agent; absent agents surround nobody."""
+    """The neighbors of each agent; absent agents are nobody's neighbors."""
 
     num_visible: Int[Array, " agents"]
     spread: Float[Array, " agents"]  # sum of the distances to all others, at most the radius each
-    nearest: Int[Array, "agents max_neighbors"] | None  # visible ones, in no order, then -1; None: not asked for
+    nearest: Int[Array, "agents max_neighbors"] | None  # visible agents in any order, then -1; None without a grid
 
 
 def neighborhood(
@@ -35,9 +36,9 @@ def neighborhood(
     is_visible: IsVisible,
     max_neighbors: int | None,
 ) -> Neighborhood:
-    """Compares all pairs, or with `max_neighbors` only agents in adjoining cells of a grid.
+    """Find the neighbors of each agent over all pairs or, with `max_neighbors`, in adjoining cells of a grid.
 
-    Both give the same counts and sums. The second also lists the nearest, and carries no gradient.
+    Both give the same counts and sums. The grid also lists the nearest visible agents, and has no gradient.
     """
     radius = jnp.asarray(radius)
     if max_neighbors is None:
@@ -66,7 +67,7 @@ class _Grid:
 
 
 def _grid(space: Space, position: Array, is_present: Array, radius: Array) -> _Grid:
-    """At most about as many cells as agents; more would be empty."""
+    """Sort the agents into at most about as many cells as there are agents."""
     limit = math.ceil(math.sqrt(len(position)))
     wide_enough = jnp.floor(space.side / (1.0001 * radius))
     num_cells = jnp.clip(wide_enough, 1, limit).astype(jnp.int32)
@@ -77,9 +78,9 @@ def _grid(space: Space, position: Array, is_present: Array, radius: Array) -> _G
 
 
 def _adjoining(space: Space, grid: _Grid, offset: Int[Array, "2"]) -> tuple[Array, Array]:
-    """Where the agents of the cell at that offset from each agent's own start in the list, and how many they are.
+    """Return the start in `grid.agent`, and the size, of the cell at this offset from each agent's own cell.
 
-    On a torus of one or two cells a side, offsets that lead to the same cell count once.
+    On a torus with one or two cells per side, offsets that lead to the same cell count once.
     """
     cell = grid.cell + offset[None]
     if isinstance(space, Torus):
@@ -95,7 +96,7 @@ def _adjoining(space: Space, grid: _Grid, offset: Int[Array, "2"]) -> tuple[Arra
 def _by_cells(
     space: Space, position: Array, is_present: Array, radius: Array, is_visible: IsVisible, max_neighbors: int
 ) -> Neighborhood:
-    """Every agent goes through the agents of nine cells one by one and keeps the nearest."""
+    """Visit the agents of nine cells one by one, for all agents in parallel, and keep the nearest."""
     num_agents, grid = len(position), _grid(space, position, is_present, radius)
     offsets, agent = jnp.array(list(itertools.product((-1, 0, 1), repeat=2))), jnp.arange(num_agents)
 

@@ -10,7 +10,7 @@ from jaxswarm.host.run import Run, split_started
 
 
 class Outcome(NamedTuple):
-    """Whether the runs are finished, which they are not after Ctrl-C, and the rows of each run."""
+    """Result of a training session: whether the runs are finished (not after Ctrl-C), and the rows of each run."""
 
     is_finished: bool
     rows: list[list[Row]]
