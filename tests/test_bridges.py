@@ -17,7 +17,7 @@ def assert_same(one, other):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_worlds_restart_and_show_what_was_before(name):
+def test_environments_restart_and_show_what_was_before(name):
     env = Gymnax(jaxswarm.make(name, **SIZES))
     action = jnp.full((3, env.num_actions), 0.5)
 

@@ -187,7 +187,7 @@ def test_a_larger_swarm_begins_with_the_policy_of_a_smaller_one(finished, tmp_pa
     assert first["eval/return"] == pytest.approx(float(jaxswarm.evaluate(larger, start)["eval/return"]), abs=1e-4)
     monkeypatch.chdir(tmp_path)
     moved = finished.rename(tmp_path / "moved")
-    assert train.main([f"resume={tmp_path / 'larger'}", "num_updates=2"]) == 0  # without the folder it began with
+    assert train.main([f"resume={tmp_path / 'larger'}", "num_updates=2"]) == 0  # needs no folder of the warm start
     moved.rename(finished)
     capsys.readouterr()
     assert train.main([*TINY, "init_from=nowhere", "run_dir=other"]) == 2
@@ -265,7 +265,7 @@ def test_a_policy_is_loaded(finished, tmp_path):
 
 def test_a_policy_outlives_the_rest_of_its_training_state(finished):
     config = configs.override(configs.load(finished / "config.yaml"), [("num_envs", 4), ("total_agent_steps", 480)])
-    assert policies.load_policies(finished, config, "best", [5]).params is not None  # its checkpoint has two worlds
+    assert policies.load_policies(finished, config, "best", [5]).params is not None  # its checkpoint has two environments
 
 
 def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch):
@@ -277,7 +277,7 @@ def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch)
     with monkeypatch.context() as patch:
         patch.setattr(files, "replace_text", full)
         assert evaluate.main([str(finished)]) == 1
-    assert "capture_time" in capsys.readouterr().out  # the table is not lost
+    assert "capture_time" in capsys.readouterr().out  # the table is printed before the file is written
     assert evaluate.main([str(finished)]) == 0
     *_, table, wrote = capsys.readouterr().out.splitlines()
     assert table.split() == ["capture_time", "-"]
@@ -320,7 +320,7 @@ def start(*overrides):
 
 
 def table(run_dir):
-    """All of metrics.csv but the time."""
+    """Return the rows of metrics.csv without the time."""
     with open(run_dir / "metrics.csv", newline="") as file:
         return [{name: x for name, x in row.items() if name != "wall_seconds"} for row in csv.DictReader(file)]
 
@@ -384,7 +384,7 @@ def test_a_task_of_ones_own_is_trained_evaluated_shown_and_plotted(tmp_path):
     assert {"replay.html", "metrics.csv"} < {path.name for path in (tmp_path / "run").iterdir()}
     (evaluated,) = (tmp_path / "run").glob("eval-*.json")
     assert [x["task"]["price"] for x in json.loads(evaluated.read_text())["results"]] == [0.1, 0.2]
-    (tmp_path / "mine.py").unlink()  # the folder has a copy, on whatever machine it is
+    (tmp_path / "mine.py").unlink()  # the run folder has a copy
     (tmp_path / "run").rename(tmp_path / "moved")
     run("train", "resume=moved", "num_updates=3")
     assert files.read_rows(tmp_path / "moved" / "metrics.csv")[-1]["update"] == 3

@@ -1,4 +1,4 @@
-"""Seeds, numbers and devices side by side: what each run gets does not depend on its company."""
+"""Vectorized seeds, numbers and devices: the result of a run does not depend on the runs beside it."""
 
 import json
 import math
@@ -112,7 +112,7 @@ def test_what_a_container_may_take_is_its_limit_less_what_it_cannot_drop(tmp_pat
 
 @pytest.fixture(scope="module")
 def with_a_diverging_run(tmp_path_factory):
-    """Two runs of two seeds in one program, of which one diverges."""
+    """Train two runs of two seeds in one program; one of the runs diverges."""
     runs_dir = tmp_path_factory.mktemp("runs")
     runs = [Run(x, settings(10), runs_dir / name) for x, name in ((EXPERIMENT, "good"), (DIVERGING, "bad"))]
     return *fit_runs(runs, progress=False), runs
@@ -144,7 +144,7 @@ def test_runs_of_several_experiments_resume_together(with_a_diverging_run, tmp_p
         return fit_runs(runs, resume=resume, progress=False)
 
     train(runs, 4, resume=False)
-    train(runs[:1], 7, resume=True)  # one is further than the other
+    train(runs[:1], 7, resume=True)  # one run is now ahead of the other
     resumed, (good, _) = train(runs, 10, resume=True)
     assert_same(resumed, states)
     assert [row["update"] for row in good if row["seed"] == 6] == [0, 3, 6, 9, 10]
@@ -243,11 +243,11 @@ def test_two_processes_train_together_and_the_first_one_writes(num_seeds, tmp_pa
         outputs = [process.communicate(timeout=200)[0] for process in processes]
         assert [process.returncode for process in processes] == [0, 0]
         assert "done: " in outputs[0]
-        assert [line for line in outputs[1].splitlines() if "Gloo" not in line] == []  # that library says hello
+        assert [line for line in outputs[1].splitlines() if "Gloo" not in line] == []  # Gloo prints a line of its own
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     rows = files.read_rows(tmp_path / "run" / "metrics.csv")
     _, expected = fit(EXPERIMENT, 12, seed=5, num_seeds=num_seeds, progress=False)
-    kept = [row for row in rows if row["update"] != 10]  # where the first session ended
+    kept = [row for row in rows if row["update"] != 10]  # the first session ended there
     assert [(row["update"], row["seed"]) for row in kept] == [(row["update"], row["seed"]) for row in expected]
     np.testing.assert_allclose(
         [row["eval/return"] for row in kept], [row["eval/return"] for row in expected], rtol=1e-5

@@ -1,4 +1,4 @@
-"""One tiny experiment, compiled once; every run of it has to end in the same bits."""
+"""Runs of one tiny experiment, compiled once: however they are interrupted, they end in the same bits."""
 
 import csv
 import shutil
@@ -28,7 +28,7 @@ OPTIONS = {"progress": False, "checkpoint_seconds": 0.0}
 
 
 class Killed(BaseException):
-    """Stands for a death that nothing can catch."""
+    """A stand-in for a kill, which no handler catches."""
 
 
 def assert_same_state(found, expected):
@@ -39,7 +39,7 @@ def assert_same_state(found, expected):
 
 
 def table(run_dir):
-    """All of metrics.csv but the time."""
+    """Return the rows of metrics.csv without the time."""
     with open(run_dir / "metrics.csv", newline="") as file:
         return [{name: x for name, x in row.items() if name != "wall_seconds"} for row in csv.DictReader(file)]
 
@@ -187,7 +187,7 @@ def test_what_python_trained_is_loaded_like_any_run(undisturbed):
 
 def test_a_checkpoint_of_another_network_is_not_resumed(undisturbed, tmp_path):
     run_dir = shutil.copytree(undisturbed[2], tmp_path / "run")
-    (run_dir / "config.yaml").unlink()  # which would have told
+    (run_dir / "config.yaml").unlink()  # it would show the difference first
     other = EXPERIMENT.replace(network=jaxswarm.ActorCritic(encoder=(5,), decoder=(4,)))
     with pytest.raises(checkpoint.CheckpointError):
         fit(other, NUM_UPDATES + 1, seed=3, run_dir=run_dir, resume=True, **OPTIONS)
@@ -195,13 +195,13 @@ def test_a_checkpoint_of_another_network_is_not_resumed(undisturbed, tmp_path):
 
 
 def test_two_processes_do_not_train_into_one_folder(tmp_path):
-    """Locks belong to open files, so that one process can play both."""
+    """Locks belong to open files, so one process can play both roles."""
     with locked(tmp_path / "run"):
         with pytest.raises(ConfigError, match="run is being trained by another process"):
             fit(EXPERIMENT, NUM_UPDATES, run_dir=tmp_path / "run", **OPTIONS)
         assert not list((tmp_path / "run").iterdir())
     with locked(tmp_path / "run"):
-        pass  # the first one has ended
+        pass  # the lock is free again
 
 
 def test_chunks_of_any_length_give_the_same(undisturbed, tmp_path, monkeypatch):
@@ -292,7 +292,7 @@ def test_another_run_is_never_overwritten(undisturbed):
 def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkpoint(tmp_path):
     run_dir = tmp_path / "run"
     fit(EXPERIMENT, 3, run_dir=run_dir, **OPTIONS)
-    (run_dir / "config.yaml").unlink()  # so that a run with another rate may be resumed
+    (run_dir / "config.yaml").unlink()  # so that a run with another learning rate resumes
     diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
     with pytest.raises(DivergedError, match=r"is (nan|inf|not finite) at update \d"):
         fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)
@@ -317,7 +317,7 @@ def test_the_curve_grows_during_training(tmp_path, monkeypatch):
 
 @pytree
 class Unrewarded(Rendezvous):
-    """Whose reward is no number."""
+    """A rendezvous whose reward is NaN."""
 
     def step(self, key, state, action):
         state, outcome = super().step(key, state, action)

@@ -57,7 +57,7 @@ MODULES = {
 
 
 def imports(path):
-    """Modules of this package that a file imports, also inside functions."""
+    """Return the modules of this package that a file imports, also inside functions."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]

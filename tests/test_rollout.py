@@ -1,4 +1,4 @@
-"""Rollouts: restarts, truncation, and the statistics of whole episodes, on a task where all of it is known."""
+"""Rollouts: restarts, truncation and statistics of complete episodes, on a task with known results."""
 
 from typing import ClassVar
 
@@ -20,7 +20,7 @@ class Clock:
 
 @pytree
 class Ticking:
-    """One agent; reward 1 + action in each step; episodes end by themselves after `length` steps or by the limit."""
+    """One agent with reward 1 + action; episodes terminate after `length` steps or are truncated at the time limit."""
 
     length: int = 100
     num_agents: int = static(default=1)
@@ -49,16 +49,16 @@ def policy(mean):
 
 @pytest.fixture(scope="module")
 def collected():
-    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronized=False)
-    return rollout.collect(jax.random.key(1), Ticking(), policy(0.0), worlds, 10, reset_pool=2)
+    envs = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronized=False)
+    return rollout.collect(jax.random.key(1), Ticking(), policy(0.0), envs, 10, reset_pool=2)
 
 
-def test_worlds_restart_after_the_last_step(collected):
-    worlds, trajectory, _ = collected
+def test_environments_restart_after_the_last_step(collected):
+    envs, trajectory, _ = collected
     np.testing.assert_array_equal(trajectory.state.time[:, 0], [0, 1, 2, 3, 0, 1, 2, 3, 0, 1])
     np.testing.assert_array_equal(trajectory.truncated[:, 0], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0])
     np.testing.assert_array_equal(trajectory.final_state.time[:, 0], [1, 2, 3, 4, 1, 2, 3, 4, 1, 2])
-    np.testing.assert_array_equal(worlds.state.time, 2)
+    np.testing.assert_array_equal(envs.state.time, 2)
 
 
 def test_start_states_are_fresh(collected):
@@ -72,23 +72,23 @@ def test_only_whole_episodes_are_counted(collected):
     assert metrics["episodes"] == 6
     np.testing.assert_allclose(metrics["return"], 4.0, rtol=1e-5)
     np.testing.assert_allclose(metrics["episode_length"], 4.0)
-    worlds = rollout.start(jax.random.key(0), Ticking(), 50, is_desynchronized=True)
-    _, trajectory, metrics = rollout.collect(jax.random.key(1), Ticking(), policy(0.0), worlds, 4, reset_pool=1)
+    envs = rollout.start(jax.random.key(0), Ticking(), 50, is_desynchronized=True)
+    _, trajectory, metrics = rollout.collect(jax.random.key(1), Ticking(), policy(0.0), envs, 4, reset_pool=1)
     assert trajectory.truncated.sum() == 50
-    assert metrics["episodes"] == (worlds.state.time == 0).sum() * 0  # those began at an unknown time
+    assert metrics["episodes"] == (envs.state.time == 0).sum() * 0  # their first steps are unknown
     assert np.isnan(metrics["return"])
 
 
 def test_episodes_go_on_across_rollouts(collected):
-    worlds, _, _ = collected
-    _, trajectory, metrics = rollout.collect(jax.random.key(2), Ticking(), policy(0.0), worlds, 3, reset_pool=1)
+    envs, _, _ = collected
+    _, trajectory, metrics = rollout.collect(jax.random.key(2), Ticking(), policy(0.0), envs, 3, reset_pool=1)
     np.testing.assert_array_equal(trajectory.state.time[:, 0], [2, 3, 0])
     np.testing.assert_allclose(metrics["return"], 4.0, rtol=1e-5)
 
 
 def test_actions_are_clipped_for_the_world_only():
-    worlds = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronized=False)
-    _, trajectory, _ = rollout.collect(jax.random.key(1), Ticking(), policy(3.0), worlds, 2, reset_pool=1)
+    envs = rollout.start(jax.random.key(0), Ticking(), 3, is_desynchronized=False)
+    _, trajectory, _ = rollout.collect(jax.random.key(1), Ticking(), policy(3.0), envs, 2, reset_pool=1)
     np.testing.assert_allclose(trajectory.action, 3.0, rtol=1e-5)
     np.testing.assert_allclose(trajectory.reward, 2.0)
 

@@ -70,7 +70,7 @@ def test_equal_runs_are_refused(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_optimizations")
-def test_a_sweep_is_interrupted_continued_and_summarised(tmp_path, monkeypatch, capsys):
+def test_a_sweep_is_interrupted_resumed_and_summarized(tmp_path, monkeypatch, capsys):
     sweep_dir, begun = tmp_path / "sweep", []
     real = execution.fit_runs
 

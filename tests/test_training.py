@@ -1,4 +1,4 @@
-"""The training program: the same bits in any chunks, side by side over seeds and numbers, evaluations apart."""
+"""The training program: equal bits for any chunks, vectorized seeds and numbers, separate evaluations."""
 
 from functools import partial
 
@@ -165,7 +165,7 @@ def test_every_episode_of_an_update_has_a_start_of_its_own():
 
 @pytest.mark.slow
 def test_a_learner_needs_no_more_than_init_and_update():
-    """And none of what on-policy learners share."""
+    """A learner without the hyperparameters that on-policy learners share."""
 
     @pytree
     class Idle:
@@ -183,7 +183,7 @@ def test_a_learner_needs_no_more_than_init_and_update():
 
 
 @pytest.mark.slow
-def test_desynchronised_worlds_start_at_random_times():
+def test_desynchronized_environments_start_at_random_times():
     experiment = Experiment(
         TASK.replace(episode_length=1000), NETWORK, LEARNER, **SIZES | {"num_envs": 50, "num_steps": 12}
     )
