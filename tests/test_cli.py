@@ -265,7 +265,7 @@ def test_a_policy_is_loaded(finished, tmp_path):
 
 def test_a_policy_outlives_the_rest_of_its_training_state(finished):
     config = configs.override(configs.load(finished / "config.yaml"), [("num_envs", 4), ("total_agent_steps", 480)])
-    assert policies.load_policies(finished, config, "best", [5]).params is not None  # its checkpoint has two environments
+    assert policies.load_policies(finished, config, "best", [5]).params is not None  # of two envs
 
 
 def test_metrics_of_which_there_are_none_are_null(finished, capsys, monkeypatch):

@@ -1,6 +1,6 @@
-"""Where discs, squares and the walls of a square world touch.
+"""Contacts of discs, squares and the walls of a square world.
 
-Worlds, any number of them, are the last axes: [..., *worlds].
+The last axes are any number of environments: [..., *envs].
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ def find_contacts(
     present: Float[Array, "boxes *envs"],
     stage: Callable,
 ) -> dict[str, Contact]:
-    """All pairs that might touch, by kind, in the order in which they are solved; `stage` calls its parts."""
+    """Return all pairs that might touch, by kind, in solving order; `stage` calls the parts of the computation."""
     return {
         "box_wall": stage(partial(_box_wall, solver), box, present, side[None, None, None]),
         "box_box": stage(partial(_box_box, solver), stage(_facing, box), present),
@@ -47,7 +47,7 @@ def find_contacts(
 
 
 def hold_discs(solver: Solver, side: Float[Array, "*envs"], disc: Pose, motion: Motion) -> Motion:
-    """The velocity of discs that walls leave them."""
+    """Return the velocity of discs after the walls have stopped them."""
 
     def held(place: Array, velocity: Array) -> Array:
         gap = side[None] / 2 - (DISC_RADIUS + solver.offsets.disc_wall) - jnp.abs(place)
@@ -58,7 +58,7 @@ def hold_discs(solver: Solver, side: Float[Array, "*envs"], disc: Pose, motion: 
 
 
 def no_impulses(disc: Float[Array, "discs *envs"], box: Float[Array, "boxes *envs"]) -> dict[str, Array]:
-    """Zeros for all contacts; made of coordinates of bodies, so that worlds may be spread over devices."""
+    """Return zeros for all contacts, computed from coordinates, so that environments can be spread over devices."""
     walls, points = np.zeros((1, 2, 1)), np.zeros((2, 1, 1))
     return {
         "disc_disc": 0 * ahead(disc),
@@ -71,7 +71,7 @@ def no_impulses(disc: Float[Array, "discs *envs"], box: Float[Array, "boxes *env
 def _disc_disc(solver: Solver, disc: Pose) -> Contact:
     own, other = of_own(disc), ahead(disc)
     is_pair, is_first = _pairs(disc.x)
-    x = own.x - other.x + 1e-9 * jnp.where(is_first, 1.0, -1.0)  # discs at one place part, too
+    x = own.x - other.x + 1e-9 * jnp.where(is_first, 1.0, -1.0)  # separates discs at the same place, too
     y = own.y - other.y
     squared = jnp.maximum(x**2 + y**2, 1e-18)
     inverse = jax.lax.rsqrt(squared)
@@ -82,7 +82,7 @@ def _disc_disc(solver: Solver, disc: Pose) -> Contact:
 
 
 def _pairs(like: Float[Array, "bodies *envs"]) -> tuple[Array, Array]:
-    """In a circle of bodies, 1 for pairs that are there for the first time, and whether the own body is the first."""
+    """Return, in cyclic order, 1 for the first occurrence of a pair, and whether the own body comes first."""
     size = like.shape[0]
     row, own = np.indices((size // 2, size))
     is_repeated = (2 * (row + 1) == size) & (own >= size // 2)
@@ -90,7 +90,7 @@ def _pairs(like: Float[Array, "bodies *envs"]) -> tuple[Array, Array]:
 
 
 def _table(values: np.ndarray, like: Array) -> Array:
-    """Numbers for each pair of bodies in all worlds, those of `like`, [bodies, *worlds]."""
+    """Broadcast numbers of each pair to all environments of `like`, [bodies, *envs]."""
     return jnp.asarray(values.reshape(*values.shape, *[1] * (like.ndim - 1)), like.dtype)
 
 
@@ -99,7 +99,7 @@ def _bias(solver: Solver, gap: Array, recovery: float) -> Array:
 
 
 def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
-    """Discs touch the nearest point of a box; one whose center is inside leaves by the nearest face."""
+    """Return contacts of discs with the nearest point of a box; a disc with its center inside leaves by the nearest face."""
     box = of_other(box)
     dx, dy = of_own(disc.x) - box.x, of_own(disc.y) - box.y
     x, y = box.cos * dx + box.sin * dy, box.cos * dy - box.sin * dx
@@ -121,13 +121,13 @@ def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
 
 @pytree
 class _Facing:
-    """Of each pair of boxes, the face of one, the reference, that separates them, and where the other box is.
+    """The separating face of each pair of boxes, which belongs to the reference box, and the pose of the other box.
 
-    In axes of the reference, u along the normal of that face and t along the face, the other box is at (u, t), turned
-    by an angle that equal squares allow to reduce to a turn of at most 45 degrees either way.
+    In axes of the reference, u along the normal of that face and t along the face, the other box is at (u, t). Because
+    the boxes are equal squares, its relative angle is reduced to at most 45 degrees in either direction.
     """
 
-    is_own: Array  # the reference is the own box; like all others [1, row, own, *worlds]
+    is_own: Array  # the reference is the own box; like all others [1, row, own, *envs]
     x: Array  # the normal, from the reference to the other box, in world axes
     y: Array
     u: Array
@@ -137,7 +137,7 @@ class _Facing:
 
 
 def _facing(box: Pose) -> _Facing:
-    """The reference is the box from whose face the other is farther."""
+    """Choose as the reference the box from whose face the other box is farther away."""
     own, other = of_own(box), ahead(box)
     dx, dy = other.x - own.x, other.y - own.y
 
@@ -168,7 +168,7 @@ def _facing(box: Pose) -> _Facing:
 
 
 def _box_box(solver: Solver, facing: _Facing, present: Array) -> Contact:
-    """Two points for each pair: the facing edge of one box, clipped to the width of the face of the other."""
+    """Return two points per pair: the facing edge of one box, clipped to the width of the other's face."""
     is_own, u, t = facing.is_own, facing.u, facing.t
     sign = jnp.where(is_own, 1.0, -1.0)
     edge_u, edge_t = u - _HALF * facing.cos, t - _HALF * facing.sin
@@ -189,12 +189,12 @@ def _box_box(solver: Solver, facing: _Facing, present: Array) -> Contact:
 
 
 def _mean(values: Array, near: Array) -> Array:
-    """Over the points of each pair that are in contact, with one point left."""
+    """Average over the points of each pair that are in contact, which leaves one point."""
     return (total(values * near, 0) / jnp.maximum(total(near, 0), 1))[None]
 
 
 def _box_wall(solver: Solver, box: Pose, present: Array, side: Array) -> Contact:
-    """The two foremost corners of boxes against the nearer of the walls x = +-side/2, and of y = +-side/2."""
+    """Return contacts of the two foremost corners of boxes with the nearer of the walls x = +-side/2, and y = +-side/2."""
     is_x = _table(np.array([True, False])[None, :, None], box.x) > 0
     flip = _table(np.array([1, -1])[:, None, None], box.x)
     box = of_own(box)

@@ -1,11 +1,11 @@
-"""The impulses that keep discs, boxes and walls apart, given where they touch.
+"""Impulses that keep discs, boxes and walls apart, for given contacts.
 
-Contacts of one kind form `Rows`, dense arrays over all pairs: to compute all pairs of a few bodies is cheaper than to
-select those that touch. Worlds, any number of them, are the last axes: [..., *worlds].
+Contacts of one kind form `Rows`, dense arrays over all pairs, because computing all pairs of a few bodies is cheaper
+than selecting those that touch. The last axes are any number of environments: [..., *envs].
 
-Bodies of two kinds meet in a table, with a row for each other body. Those of one kind stand in a circle, and row k
-pairs each with the one that is k + 1 places ahead: half a table holds every pair once, but for the last row of an even
-number, which has each twice.
+Bodies of two kinds form a table with a row for each other body. Bodies of one kind are in cyclic order, and row k pairs
+each body with the one k + 1 places ahead. Half a table then holds every pair once, except that the last row for an even
+number of bodies holds each pair twice.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from jaxswarm.types import pytree, static
 DURATION = 1.0  # s, of one step
 DISC_RADIUS = 0.0165  # m
 BOX_SIDE = 0.1  # m
-MAX_SPEED = 0.01  # m / s, that a disc is told to drive
+MAX_SPEED = 0.01  # m / s, commanded speed of a disc
 MAX_TURN_RATE = math.pi / 2  # rad / s
 
 DISC_MASS = 1.0
@@ -35,11 +35,11 @@ BOX_MASS = BOX_SIDE**2 / (math.pi * DISC_RADIUS**2)  # of the same density
 BOX_INERTIA = BOX_MASS * BOX_SIDE**2 / 6
 
 TICK = 0.1  # s; drag acts, and motors reset the velocity of discs, once in this time
-DRAG = 0.92  # share of a velocity that is left after a tick, whatever moves
+DRAG = 0.92  # share of a velocity that remains after a tick, for all bodies
 
 
 class Offsets(NamedTuple):
-    """Distances at which bodies rest, beyond touching, in meters; the defaults are those of Box2D 2.3."""
+    """Distances beyond touching at which bodies rest, in meters; the defaults are those of Box2D 2.3."""
 
     disc_disc: float = -2e-4
     disc_box: float = 2e-4
@@ -53,14 +53,14 @@ BOX2D_OFFSETS = Offsets()
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
-    """How finely a step is solved; a step of 1 s has `substeps`."""
+    """Settings of the contact solver; a step of 1 s has `substeps` substeps."""
 
     substeps: int = 10
-    iterations: int = 4  # sweeps, in which discs meet discs twice
-    relaxation: float = 1.5  # of impulses, in (0, 2); the last sweep has 1, which is exact for what one sweep can solve
-    recovery: float = 0.3  # share of an overlap with a disc that is removed per substep, by its velocity
-    box_recovery: float = 0.5  # share of an overlap without discs that is removed per substep, by displacement
-    max_speed: float = MAX_SPEED  # m / s, of the fastest disc: how far ahead contacts are seen
+    iterations: int = 4  # sweeps per substep; each solves contacts between discs twice
+    relaxation: float = 1.5  # of impulses, in (0, 2); the last sweep uses 1, which is exact if one sweep suffices
+    recovery: float = 0.3  # share of an overlap with a disc that its velocity removes per substep
+    box_recovery: float = 0.5  # share of an overlap without discs that displacement removes per substep
+    max_speed: float = MAX_SPEED  # m / s, of the fastest disc; it determines how early contacts are found
     box_friction: float = 0.01  # coefficient between boxes; discs are frictionless
     wall_friction: float = 0.0447  # between boxes and walls
     offsets: Offsets = BOX2D_OFFSETS
@@ -74,28 +74,28 @@ class Solver:
 
     @property
     def duration(self) -> float:
-        """Of a substep, in seconds."""
+        """Duration of a substep, in seconds."""
         return DURATION / self.substeps
 
     @property
     def drag(self) -> float:
-        """Share of a velocity that is left after a substep."""
+        """Share of a velocity that remains after a substep."""
         return DRAG ** (self.duration / TICK)
 
     @property
     def disc_mass(self) -> float:
-        """Motors act once a substep, not once a tick; this mass keeps the speed of pushing that of ticks."""
+        """Mass of a disc, corrected so that motors that act per substep push as fast as motors that act per tick."""
         return DISC_MASS * (1 - self.drag) / (1 - DRAG)
 
     @property
     def margin(self) -> float:
-        """Gap in meters up to which a pair counts as being in contact."""
+        """Gap in meters up to which a pair is in contact."""
         return 2 * self.max_speed * self.duration
 
 
 @pytree
 class Motion:
-    """Velocities, or displacements, of the bodies of one kind; discs do not turn by being pushed."""
+    """Velocities, or displacements, of the bodies of one kind; pushing does not turn discs."""
 
     x: Float[Array, "bodies *envs"]
     y: Float[Array, "bodies *envs"]
@@ -107,7 +107,7 @@ Motions = dict[str, Motion]  # "disc", "box"
 
 @pytree
 class Pose:
-    """Of discs or boxes, `cos` and `sin` those of their headings."""
+    """Positions of discs or boxes, with the `cos` and `sin` of their headings."""
 
     x: Float[Array, "bodies *envs"]
     y: Float[Array, "bodies *envs"]
@@ -117,9 +117,9 @@ class Pose:
 
 @pytree
 class Rows:
-    """Directions in which pairs of bodies push each other, at some points each; walls are bodies that do not move.
+    """Directions in which pairs of bodies push each other, at one or more points; walls are bodies that do not move.
 
-    `x, y` is the unit vector along which the own body is pushed; an arm is the torque of a unit force.
+    `x, y` is the unit vector along which the own body is pushed. An arm is the torque of a unit force.
     """
 
     x: Float[Array, "points row own *envs"]
@@ -132,7 +132,7 @@ class Rows:
     mass: Any = None  # once `weighted`: effective mass in contact, else 0; like the others
 
     def counts(self) -> dict[str, Float[Array, "bodies *envs"]]:
-        """How many contacts each body has, at least 1."""
+        """Return the number of contacts of each body, at least 1."""
         near = total(self.near, 0)
         count = {self.own: total(near, 0)}
         if self.other != "wall":
@@ -142,7 +142,7 @@ class Rows:
     def masses(
         self, solver: Solver, counts: dict[str, Float[Array, "bodies *envs"]]
     ) -> Float[Array, "points row own *envs"]:
-        """In contact 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)), n the number of contacts of a body; else 0."""
+        """Effective mass 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)) with n contacts per body; 0 without contact."""
 
         def mobility(kind: str, arm: Array | None) -> Array | float:
             linear, angular = _inverse_mass(kind, solver)
@@ -154,14 +154,14 @@ class Rows:
         return self.near / inverse
 
     def velocity(self, motions: Motions) -> Float[Array, "points row own *envs"]:
-        """At which pairs separate."""
+        """Return the velocity at which each pair separates."""
         result = _along(self.x, self.y, self.own_arm, of_own(motions[self.own]))
         if self.other != "wall":
             result = result - _along(self.x, self.y, self.other_arm, self._of_other(motions[self.other]))
         return result
 
     def force(self, impulse: Float[Array, "points row own *envs"]) -> "Force":
-        """What these impulses do to the pairs."""
+        """Return the change of the separation velocities by these impulses."""
 
         def torque(arm: Array | None) -> Array | None:
             return None if arm is None else total(impulse * arm, 0)
@@ -170,7 +170,7 @@ class Rows:
         return Force(x, y, torque(self.own_arm), torque(self.other_arm))
 
     def push(self, solver: Solver, motions: Motions, force: "Force") -> Motions:
-        """The motions after these impulses."""
+        """Return the motions after these impulses."""
 
         def kick(kind: str, torque: Array | None, sign: int, by_body: Callable[[Array], Array]) -> Motion:
             motion, (linear, angular) = motions[kind], _inverse_mass(kind, solver)
@@ -192,7 +192,7 @@ class Rows:
 
 
 class Force(NamedTuple):
-    """Impulses of pairs, of all their points together."""
+    """Return the impulses of pairs, summed over their points."""
 
     x: Float[Array, "row own *envs"]
     y: Float[Array, "row own *envs"]
@@ -201,35 +201,35 @@ class Force(NamedTuple):
 
 
 def of_own(bodies: Any) -> Any:
-    """Arrays [bodies, *worlds] as those of the own body of each pair."""
+    """Return arrays [bodies, *envs] for the own body of each pair."""
     return jax.tree.map(lambda v: v[None, None], bodies)
 
 
 def of_other(bodies: Any) -> Any:
-    """Arrays [bodies, *worlds] as those of the other body of each pair."""
+    """Return arrays [bodies, *envs] for the other body of each pair."""
     return jax.tree.map(lambda v: v[None, :, None], bodies)
 
 
 def ahead(bodies: Any) -> Any:
-    """Arrays [bodies, *worlds] as those of the other body of each pair in a circle."""
+    """Return arrays [bodies, *envs] for the other body of each pair, with the bodies in cyclic order."""
 
     def shifted(v: Array) -> Array:
         size, num_rows = v.shape[0], v.shape[0] // 2
-        laps = jnp.broadcast_to(v, (num_rows + 2, *v.shape)).reshape(-1, *v.shape[1:])  # row k is to begin at k + 1
+        laps = jnp.broadcast_to(v, (num_rows + 2, *v.shape)).reshape(-1, *v.shape[1:])  # row k begins at k + 1
         return laps[1 : 1 + num_rows * (size + 1)].reshape(1, num_rows, size + 1, *v.shape[1:])[:, :, :size]
 
     return jax.tree.map(shifted, bodies)
 
 
 def _behind(rows: Float[Array, "row own *envs"]) -> Float[Array, "row other *envs"]:
-    """Numbers of the pairs in a circle, by their other body."""
+    """Return values of the pairs in cyclic order, by their other body."""
     row, other = np.indices(rows.shape[:2])
     own = (other - row - 1) % rows.shape[1]
     return rows.reshape(-1, *rows.shape[2:]).at[row * rows.shape[1] + own].get(mode="promise_in_bounds")
 
 
 def _along(x: Array, y: Array, arm: Array | None, motion: Motion) -> Array:
-    """Velocity of the points of contact along a direction."""
+    """Return the velocity of the contact points along a direction."""
     result = x * motion.x + y * motion.y
     return result if arm is None else result + arm * motion.turn
 
@@ -239,9 +239,9 @@ def _inverse_mass(kind: str, solver: Solver) -> tuple[float, float]:
 
 
 def total(rows: Array, axis: int) -> Array:
-    """Sum over an axis.
+    """Return the sum over an axis.
 
-    XLA on a CPU does not vectorize loops over a few leading rows; written out they take a third of the time or less.
+    XLA on a CPU does not vectorize loops over a few leading rows; unrolled, they take at most a third of the time.
     """
     if not 0 < rows.shape[axis] <= 32:
         return rows.sum(axis)
@@ -251,35 +251,35 @@ def total(rows: Array, axis: int) -> Array:
 
 @pytree
 class Contact:
-    """All pairs of one kind.
+    """All pairs of one kind of contact.
 
-    The impulse of each point is at least 0; friction acts once for all points of a pair.
+    The impulse of each point is at least 0. Friction acts once for all points of a pair.
     """
 
     normal: Rows
     gap: Float[Array, "points row own *envs"]  # in meters, negative where bodies overlap
-    bias: Float[Array, "points row own *envs"]  # m / s, by which a pair may close; negative where it has to part
+    bias: Float[Array, "points row own *envs"]  # m / s, at which a pair may close; negative if it must separate
     tangent: Rows | None = None
     friction: float = static(default=0.0)
 
     def counts(self) -> tuple[dict[str, Array], dict[str, Array] | None]:
-        """How many contacts each body has; the same for friction, which a pair has once."""
+        """Return the number of contacts of each body, and the same for friction, which each pair has once."""
         return self.normal.counts(), self.tangent and self.tangent.counts()
 
     def masses(self, solver: Solver, counts: tuple) -> tuple[Array, Array | None]:
-        """Effective masses along normals, and along tangents if there is friction."""
+        """Return effective masses along normals, and along tangents if there is friction."""
         normal, tangent = counts
         return self.normal.masses(solver, normal), self.tangent and self.tangent.masses(solver, tangent)
 
     def weighted(self, mass: Array, tangent_mass: Array | None) -> "Contact":
-        """With effective masses."""
+        """Return the contacts with these effective masses."""
         tangent = self.tangent and dataclasses.replace(self.tangent, mass=tangent_mass)
         return dataclasses.replace(self, normal=dataclasses.replace(self.normal, mass=mass), tangent=tangent)
 
     def answer(
         self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
     ) -> tuple[Array, Array | None]:
-        """Impulses of all pairs, and of their friction, that answer these motions, where those were `impulse, slip`."""
+        """Return the impulses and friction impulses that answer these motions; the previous ones were `impulse, slip`."""
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
         impulse = jnp.maximum(impulse - relaxation * error, 0)
         if self.tangent is None or slip is None:
@@ -288,7 +288,7 @@ class Contact:
         return impulse, jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
 
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
-        """The motions after these impulses."""
+        """Return the motions after these impulses."""
         force = self.normal.force(impulse)
         if self.tangent is not None and slip is not None:
             force = Force(*jax.tree.map(operator.add, force, self.tangent.force(slip)))
@@ -296,5 +296,5 @@ class Contact:
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """The kinds of what it moves."""
+        """Kinds of bodies that this contact moves."""
         return tuple(kind for kind in ("disc", "box") if kind in (self.normal.own, self.normal.other))

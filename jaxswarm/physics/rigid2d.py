@@ -1,7 +1,7 @@
-"""Discs that push boxes about in a walled square: one pure step of rigid bodies in the plane.
+"""Discs that push boxes in a walled square: a pure step function for rigid bodies in the plane.
 
-The world of Gebhardt et al. (2018): discs are driven, boxes are only pushed, everything slides to rest. Bodies have
-momentum; contacts are solved for velocities, by accumulated impulses:
+The setting is that of Gebhardt et al. (2018): motors drive discs, boxes are only pushed, and all bodies slide to rest.
+Bodies have momentum. Contacts are solved for velocities, by accumulated impulses:
 
 * contacts are speculative: a pair may close its gap within a substep, not more;
 * the rows of one kind of contact are solved at once (projected Jacobi), kinds one after the other (Gauss-Seidel). Each
@@ -18,7 +18,7 @@ The moved states have these fields, in meters, radians and seconds, in a square 
     box_velocity  [boxes, 3]    x, y, turn rate
     box_present   [boxes] bool  absent boxes stay where they are, and nothing touches them
 
-Write `Solver(...)` for other settings than those of `PRESETS`.
+`PRESETS` holds the settings of the tasks; `Solver(...)` makes others.
 """
 
 import dataclasses
@@ -38,22 +38,22 @@ from jaxswarm.types import pytree
 # Boxes that are pressed together overlap by up to 0.2 mm in the first, and by some millimeters in the second.
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5)}
 
-BLOCK = 64  # worlds; measured, see benchmarks/LOG.md
+BLOCK = 64  # environments; measured in benchmarks/LOG.md
 
 
 def move(solver: Solver, side: Float[Array, ""] | float, state: Any, command: Float[Array, "agents 2"]) -> Any:
-    """The state one step later; `command` holds the speed (m/s) and turn rate (rad/s) of each disc's motor.
+    """Return the state one step later; `command` holds the speed (m/s) and turn rate (rad/s) of each disc's motor.
 
-    Free discs reach 0.92 of both. A disc that is held up does not turn any slower. k discs that push a box squarely
+    Free discs reach 0.92 of both. A blocked disc turns as fast as a free one. k discs that push a box squarely
     drive it at 0.92 k m v / (k m + 0.08 M). Headings of discs end in [-pi, pi], where float32 is finest.
     """
     return _simulate(_Program(solver, solver.substeps, has_inertia=True), side, state, command)
 
 
 def settle(solver: Solver, side: Float[Array, ""] | float, state: Any, substeps: int = 40) -> Any:
-    """The state with overlaps pushed apart, and at rest; without overlaps nothing moves.
+    """Return the state at rest, with overlaps pushed apart; without overlaps nothing moves.
 
-    Forty substeps part any random placement of a few bodies, to within 0.1 mm.
+    Forty substeps separate any random placement of a few bodies to within 0.1 mm.
     """
     program = _Program(solver, substeps, has_inertia=False)
     state = _simulate(program, side, state, jnp.zeros_like(state.position))
@@ -61,7 +61,7 @@ def settle(solver: Solver, side: Float[Array, ""] | float, state: Any, substeps:
 
 
 class _Program(NamedTuple):
-    """What is compiled; boxes without inertia stop after each substep."""
+    """Static settings of the compiled program; boxes without inertia stop after each substep."""
 
     solver: Solver
     num_substeps: int
@@ -83,10 +83,10 @@ def _compiled(program: _Program, *arrays: Array) -> tuple[Array, ...]:
 
 
 def _worlds_last(program: _Program) -> Callable:
-    """`_run` that under `vmap` is called once, with all worlds in the last axis, rather than mapped inside.
+    """Run `_run` once under `vmap`, with all environments in the last axis, instead of mapping inside.
 
-    A world's few bodies then lie side by side with those of all others, which made the solver three times as fast on
-    CPU. Derivatives take `_run` as it is, because JAX cannot transpose what has a batching rule of its own.
+    The few bodies of an environment are then stored beside those of the others, which made the solver three times as
+    fast on a CPU. Derivatives use `_run` directly, because JAX cannot transpose a custom batching rule.
     """
     plain = partial(_run, program, False)
     batched = jax.custom_batching.custom_vmap(
@@ -108,7 +108,7 @@ def _worlds_last(program: _Program) -> Callable:
 
 
 def _run_blocks(program: _Program, *arrays: Array) -> tuple[Array, ...]:
-    """`_run` for `BLOCK` worlds at a time, which the cache of a CPU can hold."""
+    """Run `_run` for `BLOCK` environments at a time, which fit into the cache of a CPU."""
     run = partial(_run, program, True)
     num_envs = arrays[0].shape[-1]
     if num_envs <= BLOCK:
@@ -124,12 +124,12 @@ def _run_blocks(program: _Program, *arrays: Array) -> tuple[Array, ...]:
     return tuple(x.reshape(*x.shape[:-2], -1)[..., :num_envs] for x in joined)
 
 
-# What follows takes any number of worlds as last axes: [..., *worlds].
+# The functions below take any number of environments as last axes: [..., *envs].
 
 
 @pytree
 class _Bodies:
-    """Everything that a substep changes."""
+    """State of all bodies that a substep changes."""
 
     disc: Pose
     box: Motion  # places and headings
@@ -149,7 +149,7 @@ def _run(
     box_heading: Float[Array, "boxes *envs"],
     box_velocity: Float[Array, "boxes 3 *envs"],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """The last five arguments at the end; if stages are to be compiled apart, see `_apart`."""
+    """Return the last five arguments after all substeps; `is_apart` compiles stages separately (see `_apart`)."""
     solver, num_substeps, has_inertia = program
     stage = _apart if is_apart else _together
     speed, rate = DRAG * command[:, 0], DRAG * command[:, 1]
@@ -188,7 +188,7 @@ def _wrap(angle: Array) -> Array:
 def _substep(
     solver: Solver, stage: Callable, has_inertia: bool, side: Array, present: Array, drive: Motion, bodies: _Bodies
 ) -> _Bodies:
-    """Contacts where bodies are; velocities that keep them apart; then everything moves."""
+    """Advance one substep: find contacts, solve for velocities that keep bodies apart, then move all bodies."""
     box = Pose(bodies.box.x, bodies.box.y, jnp.cos(bodies.box.turn), jnp.sin(bodies.box.turn))
     contacts = find_contacts(solver, side, bodies.disc, box, present, stage)
     counts = stage(lambda: {kind: contact.counts() for kind, contact in contacts.items()})
@@ -227,9 +227,10 @@ def _solve(
     motions: Motions,
     impulses: dict[str, Array],
 ) -> tuple[Motions, dict[str, Array]]:
-    """Sweeps over all kinds of contact, from those that give way least to those that give way most.
+    """Sweep over all kinds of contact, from the stiffest to the softest.
 
-    Discs have another turn, and walls hold them after each: piles of discs are slowest to come apart.
+    Contacts between discs are solved twice per sweep, and walls stop discs after each time, because piles of discs
+    separate most slowly.
     """
 
     def sweep(index: Array | int, carry: tuple) -> tuple:
@@ -252,12 +253,12 @@ def _solve(
 
 
 def _correct(solver: Solver, contact: Contact, motions: Motions, after: tuple, before: tuple) -> Motions:
-    """The motions, now that these are the impulses and no longer those."""
+    """Return the motions after the impulses changed from `before` to `after`."""
     return contact.push(solver, motions, *jax.tree.map(jnp.subtract, after, before))
 
 
 def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Motion:
-    """Displacements of boxes that take back a share of their overlaps, and that no velocity will remember."""
+    """Return displacements of boxes that remove a share of their overlaps without changing velocities."""
     shift = {"box": jax.tree.map(jnp.zeros_like, box)}
     for kind in ("box_box", "box_wall"):
         contact = contacts[kind]
@@ -271,10 +272,10 @@ def _together(_: Array | int, function: Callable, *args: Any) -> Any:
 
 
 def _apart(index: Array | int, function: Callable, *args: Any) -> Any:
-    """`function(*args)`, compiled by itself; `index` is that of a loop.
+    """Return `function(*args)`, compiled separately; `index` is the index of a loop.
 
-    XLA on a CPU fuses all it can, and then computes what functions share again for each of their results, which took
-    five times as long. A conditional that it cannot foresee keeps it from that. On a GPU conditionals are dear.
+    XLA on a CPU fuses as much as possible, and then recomputes shared values for each result, which took five times as
+    long. A conditional that XLA cannot predict prevents this fusion. On a GPU, conditionals are expensive.
     """
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, *args))
     return jax.lax.cond(index >= 0, function, lambda *_: nothing, *args)
