@@ -99,7 +99,7 @@ def _bias(solver: Solver, gap: Array, recovery: float) -> Array:
 
 
 def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
-    """Return contacts of discs with the nearest point of a box; a disc with its center inside leaves by the nearest face."""
+    """Return contacts of discs with the nearest point of boxes; discs with their center inside leave by the nearest face."""
     box = of_other(box)
     dx, dy = of_own(disc.x) - box.x, of_own(disc.y) - box.y
     x, y = box.cos * dx + box.sin * dy, box.cos * dy - box.sin * dx
@@ -194,7 +194,7 @@ def _mean(values: Array, near: Array) -> Array:
 
 
 def _box_wall(solver: Solver, box: Pose, present: Array, side: Array) -> Contact:
-    """Return contacts of the two foremost corners of boxes with the nearer of the walls x = +-side/2, and y = +-side/2."""
+    """Return contacts of the two foremost corners of boxes with the nearer walls of x = +-side/2 and y = +-side/2."""
     is_x = _table(np.array([True, False])[None, :, None], box.x) > 0
     flip = _table(np.array([1, -1])[:, None, None], box.x)
     box = of_own(box)

@@ -142,7 +142,7 @@ class Rows:
     def masses(
         self, solver: Solver, counts: dict[str, Float[Array, "bodies *envs"]]
     ) -> Float[Array, "points row own *envs"]:
-        """Effective mass 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)) with n contacts per body; 0 without contact."""
+        """Return 1 / (n_a (1 / m_a + arm_a^2 / I_a) + n_b (...)) with n contacts per body; 0 without contact."""
 
         def mobility(kind: str, arm: Array | None) -> Array | float:
             linear, angular = _inverse_mass(kind, solver)
@@ -279,7 +279,7 @@ class Contact:
     def answer(
         self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
     ) -> tuple[Array, Array | None]:
-        """Return the impulses and friction impulses that answer these motions; the previous ones were `impulse, slip`."""
+        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`."""
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
         impulse = jnp.maximum(impulse - relaxation * error, 0)
         if self.tangent is None or slip is None:

@@ -79,10 +79,10 @@ def _simulate(program: _Program, side: Array | float, state: Any, command: Array
 @partial(jax.jit, static_argnames="program", inline=True)
 def _compiled(program: _Program, *arrays: Array) -> tuple[Array, ...]:
     """Once for each program, so that steps outside of any `jit` are fast, too."""
-    return _worlds_last(program)(*arrays)
+    return _envs_last(program)(*arrays)
 
 
-def _worlds_last(program: _Program) -> Callable:
+def _envs_last(program: _Program) -> Callable:
     """Run `_run` once under `vmap`, with all environments in the last axis, instead of mapping inside.
 
     The few bodies of an environment are then stored beside those of the others, which made the solver three times as
@@ -95,8 +95,8 @@ def _worlds_last(program: _Program) -> Callable:
 
     @batched.def_vmap
     def many(num_envs: int, is_batched: list, *arrays: Array) -> tuple:
-        def last(x: Array, has_worlds: bool) -> Array:
-            return jnp.moveaxis(x, 0, -1) if has_worlds else jnp.broadcast_to(x[..., None], (*x.shape, num_envs))
+        def last(x: Array, has_envs: bool) -> Array:
+            return jnp.moveaxis(x, 0, -1) if has_envs else jnp.broadcast_to(x[..., None], (*x.shape, num_envs))
 
         arrays = tuple(map(last, arrays, is_batched))
         result = jax.lax.platform_dependent(*arrays, cpu=partial(_run_blocks, program), default=plain)
