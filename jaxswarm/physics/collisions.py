@@ -99,7 +99,7 @@ def _bias(solver: Solver, gap: Array, recovery: float) -> Array:
 
 
 def _disc_box(solver: Solver, disc: Pose, box: Pose, present: Array) -> Contact:
-    """Return contacts of discs with the nearest point of boxes; discs with their center inside leave by the nearest face."""
+    """Return contacts of discs with the nearest point of boxes; a disc inside a box leaves by the nearest face."""
     box = of_other(box)
     dx, dy = of_own(disc.x) - box.x, of_own(disc.y) - box.y
     x, y = box.cos * dx + box.sin * dy, box.cos * dy - box.sin * dx
