@@ -114,6 +114,8 @@ def test_fields_that_no_file_mentions_get_their_defaults():
         ("taks=rendezvous", ["'taks'", "did you mean 'task'"]),
         ("num_env=3", ["did you mean 'num_envs'", "num_steps"]),
         ("learning_rat=3", ["did you mean 'learner.learning_rate'"]),
+        ("num_world=3", ["unknown key 'num_world' (did you mean 'num_envs'?)"]),
+        ("init_from=[a,b]", ["init_from", "text"]),
         ("learning_rate=fast", ["learner.learning_rate: must ", "got 'fast'"]),
         ("name=ppo", ["name: must be one of task.name, aggregator.name, learner.name, got 'name'"]),
         ("learner.learning_rat=3", ["did you mean 'learner.learning_rate'", "learner.clip_range"]),

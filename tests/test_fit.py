@@ -1,5 +1,6 @@
 """Runs of one tiny experiment, compiled once: however they are interrupted, they end in the same bits."""
 
+import contextlib
 import csv
 import shutil
 import signal
@@ -12,6 +13,7 @@ import jaxswarm
 from jaxswarm import config, files
 from jaxswarm.config import ConfigError
 from jaxswarm.host import batch_recorder, checkpoint, ensemble, recorder
+from jaxswarm.host import fit as fitting
 from jaxswarm.host.fit import DivergedError, fit, fit_runs
 from jaxswarm.host.recorder import Recorder
 from jaxswarm.host.run import Run, locked, split_started
@@ -204,6 +206,20 @@ def test_two_processes_do_not_train_into_one_folder(tmp_path):
         pass  # the lock is free again
 
 
+def test_a_folder_that_another_process_filled_meanwhile_is_not_overwritten(undisturbed, tmp_path, monkeypatch):
+    run_dir = tmp_path / "run"
+
+    @contextlib.contextmanager
+    def locked_late(path):
+        shutil.copytree(undisturbed[2], path)
+        yield
+
+    monkeypatch.setattr(fitting, "locked", locked_late)
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        fit(EXPERIMENT, NUM_UPDATES, run_dir=run_dir, **OPTIONS)
+    assert table(run_dir) == table(undisturbed[2])
+
+
 def test_chunks_of_any_length_give_the_same(undisturbed, tmp_path, monkeypatch):
     monkeypatch.setattr(batch_recorder, "SECONDS_PER_CHUNK", 0.0)
     state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=tmp_path / "run", **OPTIONS)
@@ -349,3 +365,17 @@ def test_a_run_that_fails_before_its_first_update_leaves_no_folder(tmp_path, mon
     with pytest.raises(RuntimeError, match="no program"):
         fit(EXPERIMENT, 1, run_dir=tmp_path / "run", **OPTIONS)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["run[1]", "a\\b"])
+def test_folders_that_checkpoints_do_not_support_are_refused(tmp_path, name):
+    with pytest.raises(ConfigError, match="run_dir: must not contain"):
+        fit(EXPERIMENT, 1, run_dir=tmp_path / name, **OPTIONS)
+    assert not list(tmp_path.iterdir())
+
+
+def test_damaged_evaluations_are_named(undisturbed, tmp_path):
+    run_dir = shutil.copytree(undisturbed[2], tmp_path / "run")
+    (run_dir / "metrics.csv").write_text("update,seed\n1,x\n")
+    with pytest.raises(ConfigError, match=r"cannot read .*metrics\.csv"):
+        fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, resume=True, **OPTIONS)

@@ -3,6 +3,7 @@
 import json
 
 import jaxlib
+import pytest
 
 from jaxswarm import config
 from jaxswarm.host import manifest
@@ -27,3 +28,10 @@ def test_the_manifest_of_a_resumed_run_keeps_the_earlier_ones(tmp_path):
         manifest.write_manifest(tmp_path / "m.json", {"session": i})
     written = json.loads((tmp_path / "m.json").read_text())
     assert written == {"session": 2, "earlier_sessions": [{"session": 0}, {"session": 1}]}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", '"x"', '{"earlier_sessions": 3}'])
+def test_a_damaged_manifest_is_replaced(tmp_path, text):
+    (tmp_path / "m.json").write_text(text)
+    manifest.write_manifest(tmp_path / "m.json", {"session": 1})
+    assert json.loads((tmp_path / "m.json").read_text())["session"] == 1

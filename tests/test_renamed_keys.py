@@ -141,3 +141,17 @@ def test_a_run_of_0_1_is_a_warm_start(few_optimizations, tmp_path):
     start = start.replace(learner=start.learner.replace(params=params))
     expected = float(jaxswarm.evaluate(experiment, start)["eval/return"])
     assert files.read_rows(tmp_path / "run" / "metrics.csv")[0]["eval/return"] == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("num_worlds=2,4", "num_envs=2,4"),
+        ("learner.minibatch=agents,worlds", "learner.sampling_unit=agents,envs"),
+        ("minibatch=worlds", "sampling_unit=envs"),
+        ("task.relative_velocity=normalised", "task.relative_velocity=normalized"),
+        ("seed=3", "seed=3"),
+    ],
+)
+def test_overrides_of_sweeps_are_translated(old, new):
+    assert renamed.translate_override(old) == new

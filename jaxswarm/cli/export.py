@@ -50,6 +50,8 @@ def main(arguments: Sequence[str]) -> int:
     pairs = configs.parse(overrides)
     require_task_keys(pairs, load_config(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "policy.jax"))
+    if out.is_dir():
+        raise ConfigError(f"out: must be a file, got the folder {str(out)!r}")
     use_compile_cache()
     found = policy_on_task(paths[0], pairs, options)
     if found is None:

@@ -133,7 +133,7 @@ def _section(figure: Any, runs: dict, found: Sequence[Any], out: Path, overrides
 def _train(runs: Mapping[str, Sequence[Any]]) -> bool:
     """Train one series after another, resuming from their folders; return whether all are finished."""
     from jaxswarm.figures import figure as figures  # noqa: PLC0415
-    from jaxswarm.host import ensemble  # noqa: PLC0415
+    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
     from jaxswarm.studies import execution  # noqa: PLC0415
 
     use_compile_cache()
@@ -144,7 +144,9 @@ def _train(runs: Mapping[str, Sequence[Any]]) -> bool:
             length = f"seeds {seeds[0]} to {seeds[-1]}, {steps:,} agent steps"
             print(f"series {number + 1} of {len(runs)}: {series}, {length}")
             print(f"  {run.run_dir}", flush=True)
-            if not figures.is_finished(run) and not execution.train([run]).is_finished:
+            if figures.is_finished(run):
+                continue
+            if not execution.train([run]).is_finished or signals.exit_code():
                 return False
     return True
 

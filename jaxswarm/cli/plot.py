@@ -139,9 +139,9 @@ def _output(out: str) -> Path:
     Raises a `ConfigError` if the plot or its table would replace a file that this program did not write.
     """
     path = Path(out or "plot.png")
-    table = path.with_suffix(".csv")
     if path.suffix[1:].lower() not in plots.FORMATS:
         raise ConfigError(f"out: must be one of {', '.join(f'FILE.{x}' for x in plots.FORMATS)}, got {out!r}")
+    table = path.with_suffix(".csv")
     if path.is_dir() or table.is_dir():
         raise ConfigError(f"out: must be a file, got the folder {out!r}")
     is_ours = table.exists() and table.read_bytes().startswith(",".join(plots.COLUMNS).encode())

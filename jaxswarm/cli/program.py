@@ -43,7 +43,8 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the final flush of Python
             return 141
         except OSError as error:
-            print(f"error: {error}", file=sys.stderr)
+            reason = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error
+            print(f"error: {reason}", file=sys.stderr)
             return 1
         except RuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):

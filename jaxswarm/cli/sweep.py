@@ -9,8 +9,8 @@ from pathlib import Path
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
-from jaxswarm.config import ConfigError
-from jaxswarm.files import claim_folder, is_vacant, removed_if_empty
+from jaxswarm.config import ConfigError, renamed
+from jaxswarm.files import claim_folder, is_vacant, read_text, removed_if_empty
 
 HELP = """\
 jaxswarm-sweep key=a,b,c [key=1e-4..1e-3:5log] ... [num_seeds=N] [sweep_dir=PATH]
@@ -55,18 +55,22 @@ def main(arguments: Sequence[str]) -> int:
         if overrides or len(options) > 1:
             raise ConfigError("resume=PATH takes nothing else")
         sweep_dir = Path(options["resume"])
-        options, overrides = _load(sweep_dir)
-    else:
-        given = options.pop("sweep_dir", "")
-        sweep_dir = Path(given) if given else claim_folder(Path(f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}"))
-        if not is_vacant(sweep_dir):
-            raise ConfigError(f"sweep_dir={sweep_dir} exists and is not empty; resume it with resume={sweep_dir}")
-    with removed_if_empty(sweep_dir):
-        if "search" in options:
-            return _search(sweep_dir, options, overrides)
-        if options:
-            raise ConfigError(f"{next(iter(options))}: must be used with search=NAME")
-        return _sweep(sweep_dir, overrides)
+        return _run(sweep_dir, *_load(sweep_dir))
+    if given := options.pop("sweep_dir", ""):
+        if not is_vacant(Path(given)):
+            raise ConfigError(f"sweep_dir={given} exists and is not empty; resume it with resume={given}")
+        return _run(Path(given), options, overrides)
+    sweep_dir = claim_folder(Path(f"sweeps/{time.strftime('%Y%m%d-%H%M%S')}"))
+    with removed_if_empty(sweep_dir.parent), removed_if_empty(sweep_dir):
+        return _run(sweep_dir, options, overrides)
+
+
+def _run(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
+    if "search" in options:
+        return _search(sweep_dir, options, overrides)
+    if options:
+        raise ConfigError(f"{next(iter(options))}: must be used with search=NAME")
+    return _sweep(sweep_dir, overrides)
 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
@@ -86,7 +90,7 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
         names = ", ".join(run.folder.name for run in together)
         print(f"program {number + 1} of {len(programs)}: {names}; seeds of each: {num_seeds}", flush=True)
         is_finished, of_each = train(together)
-        if not is_finished:
+        if not is_finished or signals.exit_code():  # a signal in the last chunk stops the sweep, too
             print(f"stopped; resume with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return signals.exit_code()
         rows |= {run.run_dir: x for run, x in zip(together, of_each, strict=True)}
@@ -149,7 +153,9 @@ def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) ->
 
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
     try:
-        plan = json.loads((sweep_dir / PLAN).read_text())
-        return plan["options"], plan["overrides" if "overrides" in plan else "words"]  # words: version 0.1
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no {PLAN}") from error
+        plan = json.loads(read_text(sweep_dir / PLAN))
+        if "words" in plan:  # version 0.1
+            return dict(plan["options"]), [renamed.translate_override(text) for text in plan["words"]]
+        return dict(plan["options"]), [str(text) for text in plan["overrides"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no valid {PLAN}") from error

@@ -65,15 +65,17 @@ def _train(arguments: Sequence[str], is_first: bool) -> int:
         return _resume(Path(paths["resume"]), overrides, is_first)
     config = configs.compose(overrides)
     if "run_dir" not in paths:
-        configs.build(config)  # raises before a folder is created
+        configs.run_settings(config)  # raises before a folder is created, as the next line
+        configs.build(config)
         name = Path(_default_run_dir(config))
         run_dir = claim_folder(name) if is_first else name
-        with removed_if_empty(run_dir):
+        with removed_if_empty(run_dir.parent), removed_if_empty(run_dir):
             return _fit(config, run_dir, is_resumed=False, is_first=is_first)
     run_dir = Path(paths["run_dir"])
     if is_first and not is_vacant(run_dir):
-        hint = f"resume it with resume={run_dir}" if (run_dir / "config.yaml").exists() else "it is not a run"
-        raise ConfigError(f"run_dir={run_dir} exists and is not empty; {hint}, or choose another folder")
+        is_run = (run_dir / "config.yaml").exists()
+        hint = f"resume it with resume={run_dir}, or choose another folder" if is_run else "choose another folder"
+        raise ConfigError(f"run_dir: must be a new or empty folder, got {str(run_dir)!r}; {hint}")
     return _fit(config, run_dir, is_resumed=False, is_first=is_first)
 
 
@@ -108,7 +110,10 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
         return 1
     update = int(train_state.update.max())
     if update < run.num_updates:
-        print(f"stopped after update {update} of {run.num_updates}; resume with: {resume_command(run_dir)}")
+        hint = (
+            f"resume with: {resume_command(run_dir)}" if (run_dir / "config.yaml").exists() else "nothing was written"
+        )
+        print(f"stopped after update {update} of {run.num_updates}; {hint}")
         return signals.exit_code()
     if is_first:
         _write_replay(config, run, update)

@@ -70,7 +70,7 @@ def _absolute(key: str, value: Any) -> Any:
     """Run the imports of an override, and make its paths absolute."""
     if key == "imports":
         return plugins.run(value)
-    return str(Path(value).resolve()) if key == INIT_FROM and value else value
+    return str(Path(value).resolve()) if key == INIT_FROM and value and isinstance(value, str) else value
 
 
 def _compose_groups(pairs: Sequence[tuple[str, Any]]) -> tuple[Config, Choices]:

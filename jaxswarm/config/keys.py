@@ -152,5 +152,16 @@ def _unknown_key(key: str, prefix: str, config: Config) -> ConfigError:
     every = [*itertools.chain(*fields.values()), *top]
     same_leaf = [name for name in every if name.rpartition(".")[2] == key.rpartition(".")[2]]
     accepted = fields[prefix] if prefix else [*top, *(f"{part}.<field>" for part in PARTS)]
-    near = schema.nearest(key, same_leaf or every)
-    return ConfigError(f"key: must be one of {', '.join(accepted)}, got {key!r}{near}")
+    near = _nearest_key(key, same_leaf or every)
+    return ConfigError(f"unknown key {key!r}{near}; valid keys: {', '.join(accepted)}")
+
+
+def _nearest_key(key: str, keys: list[str]) -> str:
+    """Return a suggestion for a misspelled key: within the same part if it names one, and also for names of 0.1."""
+    part = key.partition(".")[0]
+    keys = [name for name in keys if name.startswith(f"{part}.")] if "." in key and part in PARTS else keys
+    old = {name: new for name, new in renamed.KEYS.items() if new in keys}
+    suggestion = schema.nearest(key, [*keys, *old])
+    for name, new in old.items():
+        suggestion = suggestion.replace(f"{name!r}", f"{new!r}")
+    return suggestion

@@ -25,6 +25,15 @@ def current_value(key: str, value: Any) -> str | None:
     return VALUES.get((key, value)) if isinstance(value, str) else None
 
 
+def translate_override(text: str) -> str:
+    """Return an override of version 0.1, such as `num_worlds=2,4`, with the present names."""
+    key, equals, value = text.partition("=")
+    key = current_key(key) or key
+    full = {new.rpartition(".")[2]: new for new, _ in VALUES}.get(key, key)
+    values = [current_value(full, x) or x for x in value.split(",")]
+    return f"{key}{equals}{','.join(values)}"
+
+
 def translate(config: dict[str, Any], has_field: Callable[[str, str], bool]) -> tuple[dict[str, Any], list[str]]:
     """Return the config with present names, and one text "old -> new" for each name of version 0.1 in it.
 

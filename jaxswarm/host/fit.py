@@ -117,6 +117,7 @@ def fit_runs(runs: Sequence[Run], *, resume: bool = False, progress: bool = True
         for run in runs:
             if run.run_dir and jax.process_index() == 0:
                 locks.enter_context(locked(run.run_dir))
+                check_folder(run, resume)  # another process may have trained into it since the first check
         return _fit(runs, resume, progress)
 
 

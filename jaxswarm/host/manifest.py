@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from jaxswarm.files import replace_text
+from jaxswarm.files import read_text, replace_text
 from jaxswarm.learners.on_policy import OnPolicy, batch_size
 
 PACKAGES = ("jaxswarm", "jax", "jaxlib", "flax", "optax", "distrax", "orbax-checkpoint", "numpy")
@@ -68,9 +68,9 @@ def provenance() -> dict[str, Any]:
 def write_manifest(path: Path, content: dict[str, Any]) -> None:
     """Write the manifest. A resumed run keeps the manifests of its earlier sessions under `earlier_sessions`."""
     try:
-        previous = json.loads(path.read_text())
+        previous = json.loads(read_text(path))
         content = content | {"earlier_sessions": [*previous.pop("earlier_sessions", []), previous]}
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError, AttributeError):  # missing or damaged
         pass
     replace_text(path, json.dumps(content, indent=2) + "\n")
 

@@ -105,11 +105,16 @@ def check_folder(run: Run, resume: bool) -> None:
     """Raise a `FileExistsError` if training would replace results in the run's folder or mix them with another run."""
     if run.run_dir is None:
         return
+    if any(character in str(run.run_dir.resolve()) for character in "[]\\"):
+        raise ConfigError(f"run_dir: must not contain [, ] or \\, which checkpoints do not support, got {run.run_dir}")
     if not resume:
         if (run.run_dir / "metrics.csv").exists():
             raise FileExistsError(f"{run.run_dir} already holds a run; resume it or choose another folder")
         return
-    rows = files.read_rows(run.run_dir / "metrics.csv")
+    try:
+        rows = files.read_rows(run.run_dir / "metrics.csv")
+    except ValueError as error:
+        raise ConfigError(f"cannot read {run.run_dir / 'metrics.csv'}: {error}") from error
     if rows and not (run.run_dir / "checkpoints").exists():
         raise FileExistsError(
             f"{run.run_dir} holds evaluations but no checkpoints, so it cannot be resumed; "

@@ -33,7 +33,7 @@ def stop_requests() -> Iterator[threading.Event]:
         stop.set()
         _received.append(number)
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        text = f"\n{signal.Signals(number).name}: finishing the current updates (Ctrl-C to abort)\n"
+        text = f"\n{signal.Signals(number).name}: finishing the current updates; press Ctrl-C again to abort at once\n"
         os.write(sys.stderr.fileno(), text.encode())  # the signal may have interrupted a print
 
     for number in before:
