@@ -16,7 +16,7 @@ with epy.lazy_api_imports(globals()):  # the command line answers before JAX is 
 if TYPE_CHECKING:
     from jaxswarm.tasks import Assembly, Clustering, Pursuit, Rendezvous
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "AGGREGATORS",
