@@ -123,7 +123,7 @@ def test_a_reader_that_goes_away_is_no_mistake():
 @pytest.mark.parametrize(
     ("error", "part"),
     [
-        (PermissionError(13, "Permission denied", "runs/x"), "Permission denied: 'runs/x'"),
+        (PermissionError(13, "Permission denied", "runs/x"), "runs/x: Permission denied"),
         (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"), "error: out of memory; reduce"),
     ],
 )
