@@ -497,4 +497,4 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     assert "| Bayesian agg. | 2 | 0.0 |" in report  # from the run of the other figure
     assert "| Mean agg. | 0 | not run |" in report
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
-    assert (tmp_path / "out" / "report.md").read_text().count("This figure was not run.") == 2
+    assert "| Bayesian agg. | 2 | 0.0 |" in (tmp_path / "out" / "report.md").read_text()  # the earlier section stays
