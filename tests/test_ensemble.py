@@ -89,7 +89,7 @@ def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time_and_says_if_one
     batch, said = ensemble.make_batch([EXPERIMENT], 4), []
     states = ensemble.init_batch(batch, range(4))
     ensemble.compile_batch(batch, states, 3, said.append)
-    assert [text[:24] for text in said] == ["4 runs side by side need", "training needs 0.0 GiB a"]
+    assert [text[:24] for text in said] == ["4 vectorized runs need 0", "training needs 0.0 GiB o"]
     assert said[0].endswith("1 at a time")
     assert said[1].endswith(ensemble.LESS_MEMORY)
 
