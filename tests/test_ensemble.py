@@ -163,7 +163,6 @@ def test_experiments_of_other_shapes_cannot_be_side_by_side():
 
 SPREAD = """
 import sys, jax, numpy as np
-from jaxswarm import ensemble
 from tests_config import EXPERIMENT, train
 num_runs = int(sys.argv[1])
 states, mesh = train(num_runs)
@@ -172,7 +171,8 @@ np.savez(sys.argv[4], *map(np.asarray, jax.tree.leaves(states.learner.params)))
 """
 CONFIG = f"""
 import jax, numpy as np
-from jaxswarm import config, ensemble
+from jaxswarm import config
+from jaxswarm.host import ensemble
 EXPERIMENT = config.build(config.compose({OVERRIDES.split()!r}))
 def train(num_runs):
     batch = ensemble.make_batch([EXPERIMENT], num_runs)

@@ -8,7 +8,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,12 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
 
     @functools.wraps(main)
     def program(arguments: Sequence[str] | None = None) -> int:
-        gc.set_threshold(
-            200_000
-        )  # imports and tracing make many objects and little garbage; this saves a tenth of the start-up time
-        _isolate()
+        # Imports and tracing make many objects and little garbage; this saves a tenth of the start-up time.
+        gc.set_threshold(200_000)
         try:
             arguments = sys.argv[1:] if arguments is None else arguments
-            code = _print_version() if list(arguments) == ["--version"] else main(arguments)
+            with _isolated():
+                code = _print_version() if list(arguments) == ["--version"] else main(arguments)
             sys.stdout.flush()
             return code
         except ConfigError as error:
@@ -57,13 +56,19 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
     return program
 
 
-def _isolate() -> None:
-    """Keep settings of the surroundings, as inherited from a notebook or a terminal, from ending a program."""
-    os.environ["MPLBACKEND"] = "agg"
-    os.environ.pop("JAX_ENABLE_X64", None)  # programs compute in single precision
+@contextlib.contextmanager
+def _isolated() -> Iterator[None]:
+    """Keep settings inherited from a notebook or a terminal from ending a program, and restore them after it."""
+    inherited = {name: os.environ.pop(name, None) for name in ("MPLBACKEND", "JAX_ENABLE_X64")}
+    os.environ["MPLBACKEND"] = "agg"  # without JAX_ENABLE_X64, programs compute in single precision
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):  # not a stream of the system
             stream.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        os.environ.pop("MPLBACKEND", None)
+        os.environ.update({name: value for name, value in inherited.items() if value is not None})
 
 
 def _print_version() -> int:
