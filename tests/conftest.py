@@ -1,6 +1,12 @@
-"""Make JAX strict in every test: shapes are checked at run time, and rank promotion raises an error."""
+"""Make JAX strict in every test: shapes are checked at run time, and rank promotion raises an error.
 
+Tests in `tests/faults/` damage run folders, disks and command lines. Each of their files is a kind of fault;
+`python -m pytest tests/faults --tries=1000` runs all of them and ends with `kind: passed of tried`.
+"""
+
+import collections
 import os
+from pathlib import Path
 
 import jax
 import jaxtyping
@@ -9,6 +15,31 @@ import pytest
 jaxtyping.install_import_hook("jaxswarm", "beartype.beartype")
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--tries", type=int, default=20, help="number of random cases of each test in tests/faults")
+
+
+@pytest.fixture
+def tries(request, record_property):
+    """Return the number of random cases of a test in `tests/faults`, which counts them in the summary."""
+    number = request.config.getoption("tries")
+    record_property("tries", number)
+    return number
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Print how many cases of each kind of fault passed; a random test counts as its number of tries."""
+    counts = collections.defaultdict(collections.Counter)
+    for outcome in ("passed", "failed", "error"):
+        for report in terminalreporter.stats.get(outcome, []):
+            path = Path(report.nodeid.split("::")[0])
+            if path.parent.name == "faults":
+                kind = path.stem.removeprefix("test_").replace("_", " ")
+                counts[kind][outcome] += dict(report.user_properties).get("tries", 1)
+    for kind, count in sorted(counts.items()):
+        terminalreporter.write_line(f"{kind}: {count['passed']} passed of {count.total()} tried")
 
 
 def pytest_configure(config):
