@@ -2,17 +2,21 @@
 
 import contextlib
 import csv
+import errno
 import io
 import itertools
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 RETURN = "eval/return"
+SECONDS_FOR_SPACE = 60.0  # how long training waits for space on a full disk
 Row = dict[str, Any]  # row of metrics.csv by column; empty cells are NaN
 
 INTEGERS = ("update", "agent_steps", "seed")
@@ -27,11 +31,44 @@ def replace_text(path: Path, text: str) -> None:
 def replace_bytes(path: Path, content: bytes) -> None:
     """Write a binary file atomically, as `replace_text` does."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append to a text file and flush it to disk; if that fails, the file keeps its old content."""
+    with open(path, "ab", buffering=0) as file:
+        size = file.tell()
+        try:
+            if file.write(text.encode()) < len(text.encode()):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            os.fsync(file.fileno())
+        except OSError:
+            file.truncate(size)
+            raise
+
+
+def wait_for_space(write: Callable[[], None], folder: Path) -> None:
+    """Call `write`, and call it again for up to `SECONDS_FOR_SPACE` while the disk of `folder` is full."""
+    deadline = time.monotonic() + SECONDS_FOR_SPACE
+    is_reported = False
+    while True:
+        try:
+            return write()
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or time.monotonic() >= deadline:
+                raise
+        if not is_reported:
+            print(f"warning: {folder}: no space left on device; waiting for space", file=sys.stderr, flush=True)
+            is_reported = True
+        time.sleep(0.5)
 
 
 def read_text(path: Path) -> str:
@@ -40,8 +77,10 @@ def read_text(path: Path) -> str:
 
 
 def is_vacant(folder: Path) -> bool:
-    """Return whether a folder does not exist, is empty, or holds only temporary files of an interrupted write."""
-    return not folder.exists() or (folder.is_dir() and all(map(_is_temporary, folder.iterdir())))
+    """Return whether a folder does not exist, is empty, or holds only what a killed run wrote before its config."""
+    return not folder.exists() or (
+        folder.is_dir() and all(_is_temporary(path) or path.name == "imports" for path in folder.iterdir())
+    )
 
 
 def remove_temporary_files(folder: Path) -> None:
@@ -79,57 +118,47 @@ def _is_temporary(path: Path) -> bool:
     return path.is_file() and path.name.startswith(".") and path.suffix == ".tmp"
 
 
-def append_row(path: Path, row: Row) -> None:
-    """Append a row to a CSV file and flush it to disk.
-
-    The first row of a file determines its columns. Missing values are NaN, which is an empty cell.
-    """
-    is_new = not path.exists() or path.stat().st_size == 0
-    columns = _columns(row) if is_new else _header(path)
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    if is_new:
-        writer.writerow(columns)
-    writer.writerow([_cell(row.get(name, math.nan)) for name in columns])
-    with open(path, "a", encoding="utf-8", newline="") as file:
-        file.write(buffer.getvalue())
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def read_rows(path: Path) -> list[Row]:
-    """Read all complete rows. A truncated last line is skipped; a missing file has no rows."""
+    """Read all complete rows. A truncated last line is skipped; a missing file has no rows.
+
+    Raises a `ValueError` for a file that is damaged in another way.
+    """
     text = read_text(path)
-    lines = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
-    if not lines:
-        return []
-    complete = [line for line in lines[1:] if len(line) == len(lines[0])]
-    return [{name: _number(name, cell) for name, cell in zip(lines[0], line, strict=True)} for line in complete]
-
-
-def keep_rows_before(path: Path, update: int) -> list[Row]:
-    """Remove the rows from `update` on and truncated lines; return the remaining rows."""
-    rows = [row for row in read_rows(path) if row["update"] < update]
-    if path.exists():
-        write_rows(path, rows)
-    return rows
+    return parse_rows(text[: text.rfind("\n") + 1].splitlines())
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Replace the file by these rows, which must have the same columns. Without rows the file is empty."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerows([list(rows[0]), *([_cell(x) for x in row.values()] for row in rows)] if rows else [])
-    replace_text(path, buffer.getvalue())
+    replace_text(path, "".join(f"{line}\n" for line in format_rows(rows)))
 
 
-def _columns(row: Mapping[str, Any]) -> list[str]:
+def format_rows(rows: Sequence[Row]) -> list[str]:
+    """Return the lines of a CSV file with these rows, which must have the same columns, below a header."""
+    return format_lines([list(rows[0]), *(cells(row, list(rows[0])) for row in rows)]) if rows else []
+
+
+def parse_rows(lines: Sequence[str]) -> list[Row]:
+    """Return the rows of the lines of a CSV file with a header. Lines of another length are skipped."""
+    header, *others = csv.reader(lines) if lines else [[]]
+    complete = [line for line in others if len(line) == len(header)]
+    return [{name: _number(name, cell) for name, cell in zip(header, line, strict=True)} for line in complete]
+
+
+def columns(row: Mapping[str, Any]) -> list[str]:
+    """Return the order of the columns of a file that begins with this row."""
     return [name for name in LEADING if name in row] + sorted(set(row) - set(LEADING))
 
 
-def _header(path: Path) -> list[str]:
-    with open(path, encoding="utf-8", newline="") as file:
-        return next(csv.reader(file))
+def cells(row: Row, names: Sequence[str]) -> list[str]:
+    """Return the cells of a row in these columns. Missing values are NaN, which is an empty cell."""
+    return [_cell(row.get(name, math.nan)) for name in names]
+
+
+def format_lines(table: Sequence[Sequence[str]]) -> list[str]:
+    """Return each line of a table as a line of a CSV file."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(table)
+    return buffer.getvalue().splitlines()
 
 
 def _cell(value: Any) -> str:

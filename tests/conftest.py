@@ -50,6 +50,7 @@ def pytest_configure(config):
     """
     home = config.cache.mkdir("xdg")
     os.environ["XDG_CACHE_HOME"] = str(home)
+    os.environ["XDG_STATE_HOME"] = str(config.cache.mkdir("state"))
     os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
     jax.config.update("jax_compilation_cache_dir", str(home / "jaxswarm" / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

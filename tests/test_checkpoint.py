@@ -89,7 +89,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_is_reported(copy):
     assert checkpoint.restore(copy, TEMPLATE, on_damage=said.append).update == 4
     assert len(said) == 1
     assert "5 is damaged" in said[0]
-    checkpoint.set_aside_after(copy, 4)
+    checkpoint.set_aside(copy, lambda update: update <= 4)
     write(copy, {5: -3.0})
     assert checkpoint.restore(copy, TEMPLATE).update == 5
     assert list(copy.glob("damaged-5-*"))
@@ -107,13 +107,12 @@ def test_without_any_whole_checkpoint_there_is_an_error(copy):
         checkpoint.restore(copy, TEMPLATE, on_damage=lambda _: None)
 
 
-def test_a_state_of_another_shape_is_named(written):
+def test_a_state_of_another_shape_is_named_and_not_called_damaged(written):
     said = []
     template = TEMPLATE.replace(nested=TEMPLATE.nested | {"a.b": jax.ShapeDtypeStruct((3, 5), jnp.float32)})
-    with pytest.raises(CheckpointError):
+    with pytest.raises(CheckpointError, match=r"nested\.a\.b is float32\[3, 4\], but .* float32\[3, 5\]"):
         checkpoint.restore(written, template, on_damage=said.append)
-    assert "(3, 4)" in said[0]
-    assert "(3, 5)" in said[0]
+    assert not said
 
 
 def test_where_nothing_was_written_there_is_nothing_to_restore(tmp_path):

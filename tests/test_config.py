@@ -239,6 +239,7 @@ def test_files_of_a_user_register_choices(registries, tmp_path, monkeypatch):
 def test_a_run_brings_its_imports(registries, tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(OWN)
     config = configs.compose([f"imports=[{tmp_path / 'mine.py'}]", "task=costly"])
+    plugins.keep(config["imports"], tmp_path)
     (tmp_path / "config.yaml").write_text(configs.dump(config))
     TASKS.pop("costly")
     monkeypatch.setattr(plugins, "have_run", set())

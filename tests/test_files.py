@@ -1,11 +1,14 @@
 """Rows of metrics.csv survive truncated lines, removed rows and missing files."""
 
+import errno
 import math
+import os
 
 import numpy as np
 import pytest
 
 from jaxswarm import files
+from jaxswarm.host.metrics_log import MetricsLog
 
 
 def make_row(update, **metrics):
@@ -15,8 +18,8 @@ def make_row(update, **metrics):
 
 @pytest.fixture
 def path(tmp_path):
-    for update in (0, 5, 10):
-        files.append_row(tmp_path / "metrics.csv", make_row(update))
+    (tmp_path / "checkpoints").mkdir()
+    MetricsLog(tmp_path, []).append([make_row(update) for update in (0, 5, 10)])
     return tmp_path / "metrics.csv"
 
 
@@ -34,26 +37,47 @@ def test_a_torn_last_line_is_no_row(path):
     for torn in ("15,150", "15,150,1.0,3,-4.0,1.5,2.0", "15,1\n"):
         path.write_text(path.read_text() + torn)
         assert [row["update"] for row in files.read_rows(path)] == [0, 5, 10]
-        assert len(files.keep_rows_before(path, 100)) == 3
 
 
-def test_rows_from_an_update_on_are_removed_and_written_again_the_same(path):
+def test_rows_that_are_read_are_written_again_the_same(path):
     before = path.read_text()
-    path.write_text(before + "15,15")
-    assert [row["update"] for row in files.keep_rows_before(path, 10)] == [0, 5]
-    files.append_row(path, make_row(10))
+    files.write_rows(path, files.read_rows(path))
+    assert path.read_text() == before
+    files.write_rows(path, [])
+    assert path.read_text() == ""
+
+
+def test_text_that_cannot_be_appended_leaves_the_file_as_it_was(path, monkeypatch):
+    before = path.read_text()
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        files.append_text(path, "15,150\n")
     assert path.read_text() == before
 
 
-def test_removing_all_rows_removes_the_columns_too(path):
-    assert files.keep_rows_before(path, 0) == []
-    files.append_row(path, {"update": 0, "eval/return": 1.0})
-    assert path.read_text() == "update,eval/return\n0,1.0\n"
+def test_writing_waits_for_space(path, monkeypatch, capsys):
+    attempts = []
+
+    def write():
+        attempts.append(1)
+        if len(attempts) < 3:
+            full_disk()
+
+    monkeypatch.setattr(files.time, "sleep", lambda _: None)
+    files.wait_for_space(write, path.parent)
+    assert len(attempts) == 3
+    assert capsys.readouterr().err.count("waiting for space") == 1
+    monkeypatch.setattr(files, "SECONDS_FOR_SPACE", 0)
+    with pytest.raises(OSError, match="No space"):
+        files.wait_for_space(full_disk, path.parent)
+
+
+def full_disk(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_no_file_has_no_rows(tmp_path):
     assert files.read_rows(tmp_path / "none.csv") == []
-    assert files.keep_rows_before(tmp_path / "none.csv", 5) == []
 
 
 def test_a_byte_order_mark_is_skipped(path):

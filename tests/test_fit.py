@@ -15,6 +15,7 @@ from jaxswarm.config import ConfigError
 from jaxswarm.host import batch_recorder, checkpoint, ensemble, recorder
 from jaxswarm.host import fit as fitting
 from jaxswarm.host.fit import DivergedError, fit, fit_runs
+from jaxswarm.host.metrics_log import MetricsLog
 from jaxswarm.host.recorder import Recorder
 from jaxswarm.host.run import Run, locked, split_started
 from jaxswarm.tasks import Rendezvous
@@ -241,21 +242,20 @@ def test_a_run_that_is_made_longer_is_the_long_run(undisturbed, tmp_path, first)
     assert_resumes_to_the_same(tmp_path / "run", undisturbed)
 
 
-@pytest.mark.parametrize("died_at", [0, 1, 2, 3])
+@pytest.mark.parametrize("died_at", range(8))
 @pytest.mark.parametrize("checkpoint_seconds", [0.0, 1e9])
 def test_a_killed_run_resumes_to_the_same_end(undisturbed, tmp_path, monkeypatch, died_at, checkpoint_seconds):
-    rows_written = []
+    texts_written = []
 
-    def append_half_a_row(path, row):
-        if len(rows_written) == died_at:
-            with open(path, "a") as file:
-                file.write(f"{row['update']},1")
+    def append_half_a_row(path, text):
+        if len(texts_written) == died_at:
+            append_text(path, text[: len(text) // 2])
             raise Killed
-        rows_written.append(append_row(path, row))
+        texts_written.append(append_text(path, text))
 
-    append_row, run_dir = files.append_row, tmp_path / "run"
+    append_text, run_dir = files.append_text, tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(files, "append_row", append_half_a_row)
+        patch.setattr(files, "append_text", append_half_a_row)
         patch.setattr(Recorder, "close", lambda self: self._checkpoints and self._checkpoints.close())
         options = OPTIONS | {"checkpoint_seconds": checkpoint_seconds}
         with pytest.raises(Killed):
@@ -266,15 +266,15 @@ def test_a_killed_run_resumes_to_the_same_end(undisturbed, tmp_path, monkeypatch
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_after_a_checkpoint(undisturbed, tmp_path, monkeypatch, number):
     run_dir, handlers = tmp_path / "run", [signal.getsignal(number)]
-    append_row = files.append_row
+    append = MetricsLog.append
 
-    def interrupted(path, row):
-        append_row(path, row)
-        if row["update"] == 0:
+    def interrupted(log, rows):
+        append(log, rows)
+        if rows[0]["update"] == 0:
             signal.raise_signal(number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(files, "append_row", interrupted)
+        patch.setattr(MetricsLog, "append", interrupted)
         state, _ = fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, **(OPTIONS | {"checkpoint_seconds": 1e9}))
     assert 0 < int(state.update) < NUM_UPDATES
     assert signal.getsignal(number) == handlers[0]
@@ -288,7 +288,7 @@ def test_a_damaged_checkpoint_costs_updates_and_no_bits(undisturbed, tmp_path, c
     for file in (run_dir / "checkpoints" / "8" / "state").rglob("d/*"):
         file.write_bytes(b"")
     assert_resumes_to_the_same(run_dir, undisturbed)
-    assert "8 is damaged" in capsys.readouterr().out
+    assert "8 is damaged" in capsys.readouterr().err
 
 
 def test_a_finished_run_is_left_alone(undisturbed):
@@ -308,10 +308,9 @@ def test_another_run_is_never_overwritten(undisturbed):
 def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkpoint(tmp_path):
     run_dir = tmp_path / "run"
     fit(EXPERIMENT, 3, run_dir=run_dir, **OPTIONS)
-    (run_dir / "config.yaml").unlink()  # so that a run with another learning rate resumes
     diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
     with pytest.raises(DivergedError, match=r"is (nan|inf|not finite) at update \d"):
-        fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, **OPTIONS)
+        fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, force=True, **OPTIONS)
     restored = checkpoint.restore(run_dir / "checkpoints", ensemble.abstract_state(EXPERIMENT))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(restored.train_state.learner.params))
 
@@ -374,8 +373,8 @@ def test_folders_that_checkpoints_do_not_support_are_refused(tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
-def test_damaged_evaluations_are_named(undisturbed, tmp_path):
+def test_damaged_evaluations_are_restored(undisturbed, tmp_path, capsys):
     run_dir = shutil.copytree(undisturbed[2], tmp_path / "run")
     (run_dir / "metrics.csv").write_text("update,seed\n1,x\n")
-    with pytest.raises(ConfigError, match=r"cannot read .*metrics\.csv"):
-        fit(EXPERIMENT, NUM_UPDATES, seed=3, run_dir=run_dir, resume=True, **OPTIONS)
+    assert_resumes_to_the_same(run_dir, undisturbed)
+    assert "metrics.csv has been changed or damaged" in capsys.readouterr().err

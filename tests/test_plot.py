@@ -25,11 +25,13 @@ def runs(tmp_path_factory):
     for name, seeds in SEEDS.items():
         (path / name).mkdir()
         (path / name / "config.yaml").write_text(configs.dump(config | {"aggregator": {"name": name}}))
+        rows = []
         for seed, values in seeds.items():
             for i, value in enumerate(values):
                 row = {"update": i, "agent_steps": i * 500, "wall_seconds": i + seed / 8, "seed": seed}
                 row |= {"eval/return": value, "learner/policy_loss": 1 / i if i else math.nan}
-                files.append_row(path / name / "metrics.csv", row)
+                rows.append(row)
+        files.write_rows(path / name / "metrics.csv", rows)
     return path
 
 

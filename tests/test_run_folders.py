@@ -25,12 +25,15 @@ def write(tmp_path, default):
         folder.mkdir(parents=True)
         config = configs.override(default, [("eval_every", eval_every), *changes])
         (folder / "config.yaml").write_text(configs.dump(config))
+        rows = []
         for update in range(max(map(len, returns.values()), default=0)):
             for seed, values in returns.items():
                 if update < len(values):
                     row = {"update": update * eval_every, "agent_steps": update * eval_every * 100}
                     row |= {"wall_seconds": update / 8, "seed": seed, "eval/return": values[update]}
-                    files.append_row(folder / "metrics.csv", row)
+                    rows.append(row)
+        if rows:
+            files.write_rows(folder / "metrics.csv", rows)
         return folder
 
     return write

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxswarm import config as configs
-from jaxswarm.config import Config, ConfigError, schema
+from jaxswarm.config import Config, ConfigError, plugins, schema
 
 
 def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | None], int]:
@@ -27,9 +27,10 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
         # Imports and tracing make many objects and little garbage; this saves a tenth of the start-up time.
         gc.set_threshold(200_000)
         try:
-            arguments = sys.argv[1:] if arguments is None else arguments
-            with _isolated():
-                code = _print_version() if list(arguments) == ["--version"] else main(arguments)
+            arguments = list(sys.argv[1:] if arguments is None else arguments)
+            with _isolated(), plugins.trusting("trust=true" in arguments):
+                arguments = [word for word in arguments if word not in ("trust=true", "trust=false")]
+                code = _print_version() if arguments == ["--version"] else main(arguments)
             sys.stdout.flush()
             return code
         except ConfigError as error:
@@ -96,9 +97,21 @@ def split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, str
 
 
 def split_paths(arguments: Sequence[str], names: Sequence[str]) -> tuple[list[Path], dict[str, str], list[str]]:
-    """Split arguments into paths (without "=", or existing), the program's own options, and overrides."""
+    """Split arguments into paths (without "=", or existing), the program's own options, and overrides.
+
+    `imports=...` runs these files in place of the imports that the run folders store.
+    """
     paths = [word for word in arguments if "=" not in word or Path(word).exists()]
-    return [Path(word) for word in paths], *split([word for word in arguments if word not in paths], names)
+    options, overrides = split([word for word in arguments if word not in paths], names)
+    return [Path(word) for word in paths], options, substitute_imports(overrides)
+
+
+def substitute_imports(overrides: Sequence[str]) -> list[str]:
+    """Run the imports among the overrides in place of stored ones, and return the other overrides."""
+    own = [word for word in overrides if word.startswith("imports=")]
+    for _, value in configs.parse(own):
+        plugins.substitute(value)
+    return [word for word in overrides if word not in own]
 
 
 def require_keys(
@@ -130,11 +143,18 @@ def parse_integer(name: str, value: Any, least: int) -> int:
     return number
 
 
+def parse_flag(name: str, value: str) -> bool:
+    """Return the value of an option that is true or false; raise a `ConfigError` for anything else."""
+    if value not in ("true", "false"):
+        raise ConfigError(f"{name}: must be true or false, got {value!r}")
+    return value == "true"
+
+
 def load_config(run_dir: Path) -> Config:
     """Load the config of a run folder; raise a `ConfigError` if the folder is no run folder."""
-    if not (run_dir / "config.yaml").is_file():
-        raise ConfigError(f"{run_dir} is not a run folder: it has no config.yaml")
-    return configs.load(run_dir / "config.yaml")
+    from jaxswarm.host import run  # noqa: PLC0415
+
+    return run.load_config(run_dir)
 
 
 def use_compile_cache() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
-from jaxswarm.config import ConfigError, renamed
+from jaxswarm.config import ConfigError, plugins, renamed
 from jaxswarm.files import claim_folder, is_vacant, read_text, removed_if_empty
 
 HELP = """\
@@ -55,7 +55,9 @@ def main(arguments: Sequence[str]) -> int:
         if overrides or len(options) > 1:
             raise ConfigError("resume=PATH takes nothing else")
         sweep_dir = Path(options["resume"])
-        return _run(sweep_dir, *_load(sweep_dir))
+        options, overrides = _load(sweep_dir)
+        plugins.require_trust(_imports(overrides), sweep_dir)
+        return _run(sweep_dir, options, overrides)
     if given := options.pop("sweep_dir", ""):
         if not is_vacant(Path(given)):
             raise ConfigError(f"sweep_dir={given} exists and is not empty; resume it with resume={given}")
@@ -149,6 +151,13 @@ def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) ->
         replace_text(sweep_dir / PLAN, json.dumps({"options": options, "overrides": list(overrides)}, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"cannot write to {sweep_dir}: {error.strerror}") from error
+    plugins.trust(_imports(overrides))
+
+
+def _imports(overrides: Sequence[str]) -> list[str]:
+    """Return the files and modules that a sweep imports."""
+    values = [value for _, value in configs.parse([word for word in overrides if word.startswith("imports=")])]
+    return [one for value in values for one in ([value] if isinstance(value, str) else value)]
 
 
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:

@@ -15,10 +15,12 @@ from jaxswarm.cli.program import (
     command,
     join_processes,
     load_config,
+    parse_flag,
     program,
     require_keys,
     resume_command,
     split,
+    substitute_imports,
     use_compile_cache,
     wants_help,
 )
@@ -27,11 +29,12 @@ from jaxswarm.files import claim_folder, is_vacant, removed_if_empty
 
 HELP = """\
 jaxswarm-train [group=choice | key=value] ... [run_dir=PATH]
-jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N]
+jaxswarm-train resume=PATH [num_updates=N | total_agent_steps=N] [force=true]
 jaxswarm-train [group=choice] ... --help
 
 Trains a swarm and writes a run folder: config.yaml, manifest.json, metrics.csv, curve.png, replay.html, checkpoints.
 Ctrl-C or SIGTERM stops after a checkpoint. resume=PATH continues that run exactly from its last checkpoint.
+It refuses a folder whose settings or results were changed since; force=true continues with what the folder holds.
 Several processes, on one or more machines, train together if each runs the same command with JAX_COORDINATOR_ADDRESS,
 JAX_NUM_PROCESSES and JAX_PROCESS_ID set. The first process writes the files.
 
@@ -58,11 +61,14 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _train(arguments: Sequence[str], is_first: bool) -> int:
-    paths, overrides = split(arguments, ("run_dir", "resume"))
+    paths, overrides = split(arguments, ("run_dir", "resume", "force"))
+    force = parse_flag("force", paths.pop("force", "false"))
     if "resume" in paths:
         if "run_dir" in paths:
             raise ConfigError("give only one of run_dir and resume")
-        return _resume(Path(paths["resume"]), overrides, is_first)
+        return _resume(Path(paths["resume"]), overrides, is_first, force)
+    if force:
+        raise ConfigError("force=true: must be used with resume=PATH")
     config = configs.compose(overrides)
     if "run_dir" not in paths:
         configs.run_settings(config)  # raises before a folder is created, as the next line
@@ -79,9 +85,14 @@ def _train(arguments: Sequence[str], is_first: bool) -> int:
     return _fit(config, run_dir, is_resumed=False, is_first=is_first)
 
 
-def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
+def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool, force: bool) -> int:
+    overrides = substitute_imports(overrides)
     config = load_config(run_dir)
     pairs = configs.parse(overrides)
+    changed = [f"{key}={value}" for key, value in pairs if key not in configs.LENGTHS and key in configs.flat(config)]
+    if changed:
+        new = command("jaxswarm-train", f"init_from={run_dir}", *changed)
+        raise ConfigError(f"{changed[0]}: a resumed run keeps its settings; to train its policy with others: {new}")
     require_keys(pairs, lambda key: key in configs.LENGTHS, " or ".join(f"{name}=N" for name in configs.LENGTHS))
     extended = configs.override(config, pairs)
     if pairs:
@@ -90,10 +101,10 @@ def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
         if after < before:
             key, value = pairs[0]
             raise ConfigError(f"{key}: must be at least {before} updates, got {value} ({after} updates)")
-    return _fit(extended, run_dir, is_resumed=True, is_first=is_first)
+    return _fit(extended, run_dir, is_resumed=True, is_first=is_first, force=force)
 
 
-def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int:
+def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool, force: bool = False) -> int:
     use_compile_cache()
     from jaxswarm.host import ensemble, signals  # noqa: PLC0415
     from jaxswarm.host.checkpoint import CheckpointError  # noqa: PLC0415
@@ -104,7 +115,7 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int
     ensemble.use_cores(run.settings.num_seeds)
     print(_summary(config, run), flush=True)
     try:
-        train_state, (rows,) = fit_runs([run], resume=is_resumed)
+        train_state, (rows,) = fit_runs([run], resume=is_resumed, force=force)
     except (DivergedError, CheckpointError) as error:
         print(f"error: {error}\n{_files(run_dir)}", file=sys.stderr)
         return 1

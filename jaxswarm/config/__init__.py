@@ -5,7 +5,7 @@ so this package knows no single task, aggregator or learner. Classes that a user
 without a preset. Invalid input raises a `ConfigError` with a message of one line before anything is compiled.
 """
 
-from jaxswarm.config.composition import INIT_FROM, compose, compose_pairs, dump, load, read, selection
+from jaxswarm.config.composition import INIT_FROM, activate, compose, compose_pairs, dump, load, read, selection
 from jaxswarm.config.conversion import build, build_part, describe, run_settings
 from jaxswarm.config.groups import FIGURES, REGISTERED, SEARCHES, choices, config_dir, description, preset
 from jaxswarm.config.keys import PARTS, Config, descriptions, flat, full_key, override, validate
@@ -23,6 +23,7 @@ __all__ = [
     "Config",
     "ConfigError",
     "RunSettings",
+    "activate",
     "build",
     "build_part",
     "choices",

@@ -40,14 +40,19 @@ def selection(overrides: Sequence[str] = ()) -> Choices:
 
 
 def load(path: Path) -> Config:
-    """Load the validated config of a run folder and run its imports, from the copies in the folder if files are gone.
+    """Load the validated config of a run folder and run its imports; see `read` and `activate`."""
+    return activate(read(path), path.parent)
 
-    Keys of version 0.1 are translated, which one line on stderr reports. Raises a `ConfigError`.
+
+def activate(content: Config, run_dir: Path) -> Config:
+    """Run the imports of a stored config, from their copies in the run folder, and return the validated config.
+
+    Raises a `ConfigError`.
     """
-    config = read_yaml(path)
-    imports = config.get("imports")
-    plugins.run(plugins.locate(imports, path.parent) if isinstance(imports, list) else imports or [])
-    return validate(_translate(config, path))
+    imports = content.get("imports")
+    if isinstance(imports, list) and all(isinstance(one, str) for one in imports):  # otherwise, `validate` raises
+        plugins.run_stored(imports, run_dir)
+    return validate(content)
 
 
 def read(path: Path) -> Config:

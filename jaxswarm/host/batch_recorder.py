@@ -1,7 +1,9 @@
 """The results of all runs of one program: split among their recorders, timed, and reported."""
 
+import errno
 import time
 from collections.abc import Callable, Iterator, Sequence
+from types import TracebackType
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +14,7 @@ from jaxswarm.host import ensemble
 from jaxswarm.host.ensemble import RunBatch
 from jaxswarm.host.progress import Progress
 from jaxswarm.host.recorder import Recorder
+from jaxswarm.host.resume import resume_command
 from jaxswarm.training import TrainState
 from jaxswarm.types import Metrics
 
@@ -36,8 +39,14 @@ class Chunk(NamedTuple):
     is_saved: bool
 
 
+_REMEDIES = {errno.ENOSPC: "Free some space", errno.EDQUOT: "Free some space", errno.EROFS: "Make it writable"}
+
+
 class BatchRecorder:
-    """Pass the results of a batch to the recorder of each run, and measure time."""
+    """Pass the results of a batch to the recorder of each run, and measure time.
+
+    The end of its context closes the recorders. An `OSError` then becomes one that says what was not saved.
+    """
 
     def __init__(
         self,
@@ -58,8 +67,36 @@ class BatchRecorder:
         self._started = time.monotonic() - wall_seconds
         self._wall_seconds = wall_seconds  # when the last recorded chunk was done
         self._seconds_per_update: float | None = None
+        self._num_done = start  # updates that have been computed
         self._last_save = time.monotonic()
         self._num_reported = 0
+
+    def __enter__(self) -> "BatchRecorder":
+        return self
+
+    def __exit__(self, _: type | None, error: BaseException | None, __: TracebackType | None) -> None:
+        failure = error if isinstance(error, OSError) else None
+        for recorder in self.recorders:
+            try:
+                recorder.close()
+            except OSError as of_close:
+                failure = failure or of_close
+        if failure and (error is None or failure is error):
+            raise self._disk_error(failure) from failure
+
+    def _disk_error(self, error: OSError) -> OSError:
+        """Return the error with the number of updates that were not saved, and the command that resumes."""
+        folder, num_saved = self.recorders[0].run.run_dir, min(recorder.last_saved for recorder in self.recorders)
+        if folder is None:
+            return error
+        if not folder.exists():
+            return OSError(f"{folder} was deleted or moved during training, so training stopped")
+        text = f"{folder}: {(error.strerror or str(error)).lower()}; "
+        text += f"the last {self._num_done - num_saved} updates were not saved. "
+        if not (folder / "config.yaml").exists():
+            return OSError(text + "Nothing was written")
+        remedy = _REMEDIES.get(error.errno or 0, "Mend this")
+        return OSError(f"{text}{remedy}, then run: {resume_command(folder)}")
 
     def open(self) -> None:
         """Prepare all run folders."""
@@ -80,6 +117,7 @@ class BatchRecorder:
         """Wait for a chunk and record its results."""
         metrics = jax.device_get(ensemble.fetch(self.batch, chunk.metrics))
         metrics = {name: x[:, : chunk.length] for name, x in metrics.items()}
+        self._num_done = chunk.start + chunk.length
         states = ensemble.fetch(self.batch, chunk.states_before)
         for recorder, part in self._parts():
             own = {name: x[part] for name, x in metrics.items()}

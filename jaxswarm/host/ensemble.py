@@ -215,6 +215,15 @@ def fetch(batch: RunBatch, tree: Any) -> Any:
     return jax.tree.map(local, tree)
 
 
+def broadcast_from_first(*values: int) -> list[int]:
+    """Return the values of the first process in every process, so that all make the same decisions."""
+    if jax.process_count() == 1:
+        return list(values)
+    from jax.experimental import multihost_utils  # noqa: PLC0415
+
+    return [int(x) for x in multihost_utils.broadcast_one_to_all(np.array(values))]
+
+
 def _on(batch: RunBatch) -> contextlib.AbstractContextManager:
     return contextlib.nullcontext() if batch.mesh is None else jax.set_mesh(batch.mesh)
 

@@ -8,7 +8,6 @@ trained in one program; see `ensemble`, which compiles it.
 
 import contextlib
 import dataclasses
-import math
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -25,10 +24,12 @@ from jaxswarm.config import ConfigError, RunSettings
 from jaxswarm.files import Row
 from jaxswarm.host import ensemble, loggers, trained
 from jaxswarm.host.batch_recorder import BatchRecorder, Chunk, DivergedError
-from jaxswarm.host.checkpoint import Restored, restore, set_aside_after
+from jaxswarm.host.checkpoint import Restored
 from jaxswarm.host.ensemble import RunBatch, abstract_state
+from jaxswarm.host.metrics_log import MetricsLog
 from jaxswarm.host.progress import Progress
 from jaxswarm.host.recorder import Recorder, plot_curve
+from jaxswarm.host.resume import ResumePoint, final_lines, resume_points
 from jaxswarm.host.run import Run, check_folder, locked, split_started
 from jaxswarm.host.signals import stop_requests
 from jaxswarm.training import Experiment, TrainState
@@ -46,6 +47,7 @@ def fit(
     num_seeds: int | None = None,
     run_dir: str | Path | None = None,
     resume: bool = False,
+    force: bool = False,
     progress: bool = True,
     checkpoint_seconds: float = 30.0,
     keep_checkpoints: int = 3,
@@ -63,13 +65,15 @@ def fit(
 
     With `run_dir` the folder gets `config.yaml` (if `config.describe` finds a config for the experiment),
     `manifest.json`, `metrics.csv`, `checkpoints/` (the latest `keep_checkpoints` and the best, saved at most every
-    `checkpoint_seconds`) and `curve.png`. With `resume` the run continues from its last checkpoint.
+    `checkpoint_seconds`) and `curve.png`. With `resume` the run continues from its last checkpoint. If the settings
+    or the rows of `metrics.csv` have changed since, `force` continues with the new ones.
 
     Raises:
         DivergedError: All seeds have diverged.
         CheckpointError: There are checkpoints, but none can be restored.
         FileExistsError: The folder holds another run, or evaluations without checkpoints.
-        ConfigError: A setting is impossible.
+        ConfigError: A setting is impossible, or the folder has changed since the checkpoint.
+        OSError: A file cannot be written; the last checkpoint is intact.
     """
     for name in log_to:
         loggers.import_package(name)
@@ -85,7 +89,7 @@ def fit(
     folder = None if run_dir is None else Path(run_dir)
     config = None if folder is None else _described(experiment, given, folder)
     run = Run(experiment, settings, folder, config, on_evaluation, init_params)
-    states, (rows,) = fit_runs([run], resume=resume, progress=progress)
+    states, (rows,) = fit_runs([run], resume=resume, force=force, progress=progress)
     return (jax.tree.map(lambda x: x[0], states) if num_seeds is None else states), rows
 
 
@@ -97,14 +101,16 @@ def _described(experiment: Experiment, given: Mapping[str, Any], run_dir: Path) 
     return config
 
 
-def fit_runs(runs: Sequence[Run], *, resume: bool = False, progress: bool = True) -> tuple[TrainState, list[list[Row]]]:
+def fit_runs(
+    runs: Sequence[Run], *, resume: bool = False, progress: bool = True, force: bool = False
+) -> tuple[TrainState, list[list[Row]]]:
     """Train several runs in one program, as `fit` does; they differ in numbers, seeds and folders only.
 
     Returns states with a leading axis, the seeds of the first run first, and the rows of each run. With `resume`, all
     runs resume from the last update of which each has a checkpoint; new runs and runs to resume are not mixed.
     """
     for run in runs:
-        check_folder(run, resume)
+        check_folder(run, resume, force)
         for name in run.settings.loggers:
             loggers.import_package(name)
     runs = [_prepared(run) for run in runs]
@@ -117,8 +123,8 @@ def fit_runs(runs: Sequence[Run], *, resume: bool = False, progress: bool = True
         for run in runs:
             if run.run_dir and jax.process_index() == 0:
                 locks.enter_context(locked(run.run_dir))
-                check_folder(run, resume)  # another process may have trained into it since the first check
-        return _fit(runs, resume, progress)
+                check_folder(run, resume, force)  # another process may have trained into it since the first check
+        return _fit(runs, resume_points(runs, force) if resume else None, progress)
 
 
 def _prepared(run: Run) -> Run:
@@ -143,29 +149,26 @@ def _check_params(run: Run, params: Any) -> None:
         )
 
 
-def _fit(runs: Sequence[Run], resume: bool, progress: bool) -> tuple[TrainState, list[list[Row]]]:
+def _fit(runs: Sequence[Run], points: list[ResumePoint] | None, progress: bool) -> tuple[TrainState, list[list[Row]]]:
     """Train runs whose folders are locked."""
     is_first = jax.process_index() == 0  # of several processes, only the first one writes and prints
     num_updates = runs[0].num_updates
-    restored = _restore(runs) if resume else None
+    restored = [point.restored for point in points] if points else []
     if restored and restored[0].update >= num_updates:
         if progress and is_first:
             print(f"{runs[0].run_dir} is finished: {restored[0].update} of {num_updates} updates are done")
-        return _concatenate(restored), [_finished_rows(run) for run in runs]
+        return _concatenate(restored), [_finished_rows(*pair) for pair in zip(runs, restored, strict=True)]
     batch = ensemble.make_batch([run.experiment for run in runs], len(runs[0].seeds))
     runs = runs if is_first else [dataclasses.replace(run, run_dir=None, on_evaluation=None) for run in runs]
     start = restored[0].update if restored else 0
     agent_steps = runs[0].experiment.agent_steps_per_update * batch.num_runs
     with Progress(start, num_updates, agent_steps, progress and is_first) as shown, stop_requests() as stop:
-        recorders = [Recorder(run, restored[i] if restored else None) for i, run in enumerate(runs)]
+        recorders = [Recorder(run, points[i] if points else None) for i, run in enumerate(runs)]
         wall_seconds = restored[0].record["wall_seconds"] if restored else 0.0
-        recorder = BatchRecorder(batch, recorders, shown, start, wall_seconds, _broadcast_from_first)
-        try:
+        recorder = BatchRecorder(batch, recorders, shown, start, wall_seconds, ensemble.broadcast_from_first)
+        with recorder:
             states = ensemble.place(batch, _concatenate(restored)) if restored else _initial(batch, runs)
             states = _train(states, num_updates, recorder, stop)
-        finally:
-            for one in recorders:
-                one.close()
     return states, [one.rows for one in recorders]
 
 
@@ -189,7 +192,7 @@ def _train(states: TrainState, num_updates: int, recorder: BatchRecorder, stop: 
     while update < num_updates:
         length = min(eval_every - update % eval_every, num_updates - update, size, recorder.chunk_length())
         decisions = (length, recorder.is_checkpoint_due(), stop.is_set())
-        length, is_due, is_stopped = _broadcast_from_first(*decisions)
+        length, is_due, is_stopped = ensemble.broadcast_from_first(*decisions)
         if is_stopped:
             break
         is_wanted = recorder.needs_states and (update % eval_every == 0 or is_due)
@@ -214,43 +217,15 @@ def _copy(states: TrainState) -> TrainState:
     return jax.tree.map(jnp.copy, states)
 
 
-def _broadcast_from_first(*values: int) -> list[int]:
-    """Return the values of the first process in every process, so that all make the same decisions."""
-    if jax.process_count() == 1:
-        return list(values)
-    from jax.experimental import multihost_utils  # noqa: PLC0415
-
-    return [int(x) for x in multihost_utils.broadcast_one_to_all(np.array(values))]
-
-
-def _restore(runs: Sequence[Run]) -> list[Restored] | None:
-    """Restore each run from the last update of which all have a checkpoint; `None` if one of them has none."""
-    up_to = math.inf
-    while True:
-        found = []
-        for run in runs:
-            assert run.run_dir
-            template = abstract_state(run.experiment, len(run.seeds))
-            found.append(restore(run.run_dir / "checkpoints", template, up_to=up_to))
-        updates = [x.update if x else -1 for x in found]
-        if min(updates) == max(updates) or min(updates) < 0:
-            break
-        up_to = min(updates)
-    _broadcast_from_first(0)  # waits until every process has finished reading
-    if jax.process_index() == 0:
-        for run in runs:
-            assert run.run_dir
-            set_aside_after(run.run_dir / "checkpoints", min(updates))
-    return None if min(updates) < 0 else found
-
-
 def _concatenate(restored: Sequence[Restored]) -> TrainState:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *[x.train_state for x in restored])
 
 
-def _finished_rows(run: Run) -> list[Row]:
-    assert run.run_dir
-    rows = files.read_rows(run.run_dir / "metrics.csv")
-    if rows and not (run.run_dir / "curve.png").exists():
+def _finished_rows(run: Run, restored: Restored) -> list[Row]:
+    lines = final_lines(run, restored)
+    if jax.process_index() == 0:
+        MetricsLog(run.folder, lines)
+    rows = files.parse_rows(lines)
+    if rows and not (run.folder / "curve.png").exists():
         plot_curve(run, rows)
     return rows

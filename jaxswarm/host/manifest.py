@@ -67,12 +67,20 @@ def provenance() -> dict[str, Any]:
 
 def write_manifest(path: Path, content: dict[str, Any]) -> None:
     """Write the manifest. A resumed run keeps the manifests of its earlier sessions under `earlier_sessions`."""
-    try:
-        previous = json.loads(read_text(path))
-        content = content | {"earlier_sessions": [*previous.pop("earlier_sessions", []), previous]}
-    except (OSError, ValueError, TypeError, AttributeError):  # missing or damaged
-        pass
+    previous = read_manifest(path)
+    if previous:
+        earlier = previous.pop("earlier_sessions", [])
+        content = content | {"earlier_sessions": [*(earlier if isinstance(earlier, list) else []), previous]}
     replace_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Return the content of a manifest; one that is missing or damaged is empty."""
+    try:
+        content = json.loads(read_text(path))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _version(name: str) -> str | None:

@@ -15,8 +15,11 @@ from jaxswarm.analysis import training_curve
 from jaxswarm.config import plugins
 from jaxswarm.files import RETURN, Row
 from jaxswarm.host import manifest
-from jaxswarm.host.checkpoint import Checkpoints, Restored
+from jaxswarm.host.checkpoint import Checkpoints
+from jaxswarm.host.identity import Identity, identify
 from jaxswarm.host.loggers import LOGGERS, Logger
+from jaxswarm.host.metrics_log import MetricsLog
+from jaxswarm.host.resume import ResumePoint
 from jaxswarm.host.run import Run
 from jaxswarm.training import TrainState, is_loss
 
@@ -38,41 +41,62 @@ class _Candidate:
 class Recorder:
     """Record the results of updates, in order. Arrays are [seeds, ...], in the order of the run's seeds."""
 
-    def __init__(self, run: Run, restored: Restored | None):
+    def __init__(self, run: Run, point: ResumePoint | None):
+        restored = point.restored if point else None
         record: dict[str, Any] = restored.record if restored else {}
         self.run = run
-        self.rows: list[Row] = []
+        self.rows: list[Row] = files.parse_rows(point.lines) if point else []
         self.reason: dict[int, str] = {int(seed): x for seed, x in record.get("diverged", {}).items()}
         self._since_evaluation: dict[str, list[list[float]]] = record.get("since_evaluation", {})  # [updates][seeds]
-        self._start = restored.update if restored else 0
+        self._point = point
+        self._identity: Identity | None = None
+        self._log: MetricsLog | None = None
         self._checkpoints: Checkpoints | None = None
         self._loggers: dict[int, list[Logger]] = {}
         self._last: _Candidate | None = None
         self._best: _Candidate | None = None  # better than every checkpoint on disk, and not saved yet
         self._last_plotted = time.monotonic()
+        self.last_saved = restored.update if restored else 0  # update of the latest checkpoint, once this is closed
 
     def open(self) -> None:
         """Prepare the run folder, once the first chunk has been compiled and dispatched."""
         run, run_dir = self.run, self.run.run_dir
         if run_dir:
             files.remove_temporary_files(run_dir)
-            if run.config is not None:
-                files.replace_text(run_dir / "config.yaml", configs.dump(dict(run.config)))
-                plugins.keep(run.config.get("imports", []), run_dir)
-            content = manifest.describe(run.experiment, run.num_updates, run.seeds)
-            manifest.write_manifest(run_dir / "manifest.json", content)
-            self.rows = files.keep_rows_before(run_dir / "metrics.csv", self._start)
-            self._checkpoints = Checkpoints(run_dir / "checkpoints", run.settings.keep_checkpoints)
+            files.wait_for_space(self._write_description, run_dir)
+            self._checkpoints = Checkpoints(run_dir / "checkpoints", run.settings.keep_checkpoints, self._identity)
+            self._log = MetricsLog(run_dir, self._point.lines if self._point else [])
             for seed in run.seeds:
                 self._loggers[seed] = [LOGGERS[name](run_dir, run.config, seed) for name in run.settings.loggers]
 
+    def _write_description(self) -> None:
+        """Write everything that describes the run: copies of its imports, config, and manifest."""
+        run = self.run
+        imports = {}
+        if run.config is not None:
+            imports = plugins.keep(run.config.get("imports", []), run.folder)
+            files.replace_text(run.folder / "config.yaml", configs.dump(dict(run.config)))
+        before = self._point.restored.identity if self._point else None
+        run_id = self._identity["run_id"] if self._identity else before["run_id"] if before else None
+        self._identity = identify(run_id, run.config, run.experiment, imports)
+        content = manifest.describe(run.experiment, run.num_updates, run.seeds)
+        content |= {"run_id": self._identity["run_id"], "imports": imports}
+        content |= {"changes_since_checkpoint": self._point.changes if self._point else []}
+        manifest.write_manifest(run.folder / "manifest.json", content)
+
     def close(self) -> None:
-        """Save the best states, wait until all files are on disk, and plot the curve."""
-        if self._checkpoints:
-            if self._best:
-                self._save(self._best)
-            self._checkpoints.close()
-            self._checkpoints = None
+        """Save the best states, wait until all files are on disk, and plot the curve.
+
+        Raises an `OSError` if a checkpoint could not be written.
+        """
+        checkpoints, self._checkpoints = self._checkpoints, None
+        if checkpoints:
+            try:
+                if self._best:
+                    _save(checkpoints, self._best)
+                checkpoints.close()
+            finally:
+                self.last_saved = checkpoints.last_written
         for logger in (x for loggers in self._loggers.values() for x in loggers):
             logger.close()
         self._loggers = {}
@@ -105,6 +129,8 @@ class Recorder:
         record = self._resume_record(wall_seconds)
         if evaluation is not None:
             self._add_rows(update, wall_seconds, evaluation)
+        if self._log:
+            record["final_rows"] = self._log.digest
         if self._checkpoints:
             score = None if evaluation is None else self._score(evaluation)
             self._consider(_Candidate(update, states, record, score))
@@ -112,9 +138,15 @@ class Recorder:
 
     def save(self) -> None:
         """Write the best states, if they are not on disk yet, and the latest ones."""
+        if not self._checkpoints:
+            return
+        config = self.run.folder / "config.yaml"
+        if self.run.config is not None and not config.exists() and self.run.folder.exists():
+            self._write_description()
+            print(f"warning: {config} was deleted during training; it is restored", file=sys.stderr)
         for candidate in (self._best, self._last):
             if candidate:
-                self._save(candidate)
+                _save(self._checkpoints, candidate)
         self._best = None
 
     def latest_return(self) -> float | None:
@@ -142,11 +174,16 @@ class Recorder:
 
     def _resume_record(self, wall_seconds: float) -> dict[str, Any]:
         """Return what resuming needs besides the training state."""
-        diverged = {str(seed): reason for seed, reason in self.reason.items()}
-        return {"wall_seconds": wall_seconds, "since_evaluation": self._since_evaluation, "diverged": diverged}
+        return {
+            "wall_seconds": wall_seconds,
+            "since_evaluation": self._since_evaluation,
+            "diverged": {str(seed): reason for seed, reason in self.reason.items()},
+            "rows": self._log.digest if self._log else None,
+        }
 
     def _add_rows(self, update: int, wall_seconds: float, evaluation: dict[str, np.ndarray]) -> None:
         """Add a row per seed: its evaluation at `update`, and means over the updates since the previous row."""
+        rows = []
         for index, seed in enumerate(self.run.seeds):
             if seed not in self.reason and not np.isfinite(evaluation[RETURN][index]):
                 self.reason[seed] = f"{RETURN} is {evaluation[RETURN][index]} at update {update}"
@@ -159,18 +196,20 @@ class Recorder:
                 "wall_seconds": wall_seconds,
                 "seed": seed,
             }
-            self._add_row(row | {name: float(x[index]) for name, x in evaluation.items()} | means)
+            rows.append(row | {name: float(x[index]) for name, x in evaluation.items()} | means)
+        self._write_rows(rows)
         self._since_evaluation = {name: [] for name in self._since_evaluation}
         if self.run.run_dir and self.rows and time.monotonic() - self._last_plotted >= SECONDS_PER_CURVE:
             plot_curve(self.run, self.rows)
             self._last_plotted = time.monotonic()
 
-    def _add_row(self, row: Row) -> None:
-        self.rows.append(row)
-        if self.run.run_dir:
-            files.append_row(self.run.run_dir / "metrics.csv", row)
-        for logger in self._loggers.get(row["seed"], []):
-            logger.log(row)
+    def _write_rows(self, rows: Sequence[Row]) -> None:
+        self.rows.extend(rows)
+        if self._log:
+            self._log.append(rows)
+        for row in rows:
+            for logger in self._loggers.get(row["seed"], []):
+                logger.log(row)
 
     def _consider(self, candidate: _Candidate) -> None:
         """Keep the states as the latest ones, and as the best ones if their score is the highest."""
@@ -180,9 +219,9 @@ class Recorder:
             self._best = candidate
         self._last = candidate
 
-    def _save(self, candidate: _Candidate) -> None:
-        assert self._checkpoints
-        self._checkpoints.save(candidate.update, candidate.states, candidate.record, candidate.score)
+
+def _save(checkpoints: Checkpoints, candidate: _Candidate) -> None:
+    checkpoints.save(candidate.update, candidate.states, candidate.record, candidate.score)
 
 
 def plot_curve(run: Run, rows: Sequence[Row]) -> None:

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 
 from jaxswarm import config as configs
-from jaxswarm.config import Config, ConfigError, RunSettings
+from jaxswarm.config import Config, ConfigError, RunSettings, plugins
 from jaxswarm.host.checkpoint import restore
 from jaxswarm.host.ensemble import abstract_state
-from jaxswarm.host.run import has_checkpoint
+from jaxswarm.host.run import has_checkpoint, load_config
 from jaxswarm.training import Experiment
 
 
@@ -26,7 +26,7 @@ class TrainedPolicies(NamedTuple):
 
 
 def load(
-    run_dir: str | Path, which: Literal["best", "last"] = "best", seed: int | None = None
+    run_dir: str | Path, which: Literal["best", "last"] = "best", seed: int | None = None, *, trust: bool = False
 ) -> tuple[Experiment, Any]:
     """Load the experiment of a run folder and the parameters of its policy, of one seed (`None`: the first).
 
@@ -35,10 +35,15 @@ def load(
         experiment, params = jaxswarm.load("runs/NAME")
         distribution = experiment.network.apply(params, experiment.task.observe(state), method="policy")
 
-    Raises a `ConfigError` if the folder is no run folder, has no checkpoint or not this seed, and a `CheckpointError`
-    if no checkpoint can be restored. Damaged checkpoints are skipped, and each is reported with one line.
+    The folder's copies of your `imports` are executed if you have trained with the same code on this machine. With
+    `trust`, code of others is executed, too.
+
+    Raises a `ConfigError` if the folder is no run folder, would execute code of others, has no checkpoint or not this
+    seed, and a `CheckpointError` if no checkpoint can be restored. Damaged checkpoints are skipped, and each is
+    reported with one line.
     """
-    config = configs.load(Path(run_dir) / "config.yaml")
+    with plugins.trusting(trust):
+        config = load_config(Path(run_dir))
     seeds = configs.run_settings(config).seeds
     policies = load_policies(Path(run_dir), config, which, seeds[:1] if seed is None else [seed])
     return policies.experiment, jax.tree.map(lambda x: x[0], policies.params)
