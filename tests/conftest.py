@@ -10,11 +10,14 @@ from pathlib import Path
 
 import jax
 import jaxtyping
+import psutil
 import pytest
 
 jaxtyping.install_import_hook("jaxswarm", "beartype.beartype")
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+MAX_MEMORY = 2 * 2**30  # bytes
 
 
 def pytest_addoption(parser):
@@ -55,6 +58,14 @@ def pytest_configure(config):
     jax.config.update("jax_compilation_cache_dir", str(home / "jaxswarm" / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     jax.config.update("jax_disable_most_optimizations", config.option.markexpr == "not slow")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Drop the compiled programs of a file that has compiled many, because XLA crashes when it maps too much memory."""
+    yield
+    if psutil.Process().memory_info().rss > MAX_MEMORY:
+        jax.clear_caches()
 
 
 @pytest.fixture

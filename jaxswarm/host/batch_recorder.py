@@ -89,7 +89,7 @@ class BatchRecorder:
         folder, num_saved = self.recorders[0].run.run_dir, min(recorder.last_saved for recorder in self.recorders)
         if folder is None:
             return error
-        if not folder.exists():
+        if error.errno == errno.ENOENT and not (folder / "config.yaml").exists():
             return OSError(f"{folder} was deleted or moved during training, so training stopped")
         text = f"{folder}: {(error.strerror or str(error)).lower()}; "
         text += f"the last {self._num_done - num_saved} updates were not saved. "

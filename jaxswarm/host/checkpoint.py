@@ -27,6 +27,8 @@ from jaxswarm.files import replace_text, wait_for_space
 
 _RECORD = Path("record", "metadata")  # where Orbax wrote the JSON record in version 0.1
 _DIGESTS = "digests.json"
+_OVERHEAD = 2**18  # bytes of a checkpoint besides its arrays
+_NUM_FILES = 64  # of a checkpoint and its folders, at most
 
 
 class CheckpointError(RuntimeError):
@@ -90,9 +92,15 @@ class Checkpoints:
         self._pending.result()
 
     def _write(self, update: int, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
-        def write() -> None:
+        def write(attempts: int = 3) -> None:
             self._directory.mkdir(exist_ok=True)
-            _write(self._directory, update, arrays, record)
+            try:
+                _write(self._directory, update, arrays, record)
+            except FileNotFoundError:  # somebody is deleting the directory
+                if attempts == 1:
+                    raise
+                threading.Event().wait(0.2)
+                write(attempts - 1)
 
         wait_for_space(write, self._directory.parent)
         self.last_written = update
@@ -197,6 +205,7 @@ def _verified_record(path: Path) -> dict[str, Any]:
 def _write(directory: Path, update: int, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
     """Write a checkpoint completely, in place of an earlier one of this update."""
     temporary = directory / f".{update}.tmp"
+    _require_space(directory, sum(x.nbytes for x in arrays.values()))
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         (temporary / _RECORD).parent.mkdir(parents=True)
@@ -209,6 +218,14 @@ def _write(directory: Path, update: int, arrays: dict[str, np.ndarray], record: 
     except Exception as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise _as_os_error(error, directory) from error
+
+
+def _require_space(directory: Path, size: int) -> None:
+    """Raise an `OSError` if the disk has no space for arrays of this size; Orbax prints tracebacks if it is full."""
+    disk = os.statvfs(directory)
+    is_short = disk.f_bavail * disk.f_frsize < 1.1 * size + _OVERHEAD
+    if is_short or (disk.f_files and disk.f_favail < _NUM_FILES):  # some file systems have no fixed number of files
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(directory))
 
 
 def _remove(path: Path) -> None:
@@ -224,8 +241,8 @@ def _as_os_error(error: Exception, directory: Path) -> OSError:
     """Return the error of the operating system that stopped Orbax, which reports its number as text."""
     if isinstance(error, OSError) and error.errno:
         return error
-    number = re.search(r"OS error (\d+)", str(error))
-    code = int(number[1]) if number else errno.ENOSPC if "No space left" in str(error) else errno.EIO
+    number = re.search(r"os_error_code='(\d+)'|OS error (\d+)", str(error))
+    code = int(number[1] or number[2]) if number else errno.ENOENT if "NOT_FOUND" in str(error) else errno.EIO
     return OSError(code, os.strerror(code) if number else " ".join(str(error).split())[:200], str(directory))
 
 
