@@ -117,10 +117,10 @@ class Recorder:
                 self._save(candidate)
         self._best = None
 
-    def latest_return(self) -> float | None:
-        """Return the median over seeds of the latest evaluation, `None` without one."""
+    def latest_return(self) -> tuple[int, float] | None:
+        """Return the update and the median return over seeds of the latest evaluation, `None` without one."""
         latest = [row[RETURN] for row in self.rows if row["update"] == self.rows[-1]["update"]]
-        return float(np.median(latest)) if latest else None
+        return (self.rows[-1]["update"], float(np.median(latest))) if latest else None
 
     @property
     def diverged(self) -> list[int]:
@@ -156,6 +156,7 @@ class Recorder:
             row = {
                 "update": update,
                 "agent_steps": update * self.run.experiment.agent_steps_per_update,
+                "env_steps": update * self.run.experiment.env_steps_per_update,
                 "wall_seconds": wall_seconds,
                 "seed": seed,
             }
