@@ -29,7 +29,7 @@ LEVELS = [
     {"config.composition", "config.conversion"},
     {"config", "host.checkpoint", "host.progress", "host.manifest", "host.ensemble"},
     {"analysis.curves", "analysis.comparability", "render.film", "host.loggers"},
-    {"analysis.plots", "render.page", "render.pictures"},
+    {"analysis.plots", "analysis.summaries", "render.page", "render.pictures"},
     {"analysis.training_curve", "analysis.run_folders", "render"},
     {"analysis"},
     {"host.run"},

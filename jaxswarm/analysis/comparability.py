@@ -33,9 +33,9 @@ class Comparison(NamedTuple):
             return ""
         reason = f"the return depends on {', '.join(f'task.{name}' for name in self.settings)}"
         if self.metric == RETURN:
-            return f"{reason}, so returns are not comparable; the task declares no other metric for this"
+            return f"{reason}, so returns are not comparable; the task declares no metric that does not"
         direction = "higher" if self.is_higher_better else "lower"
-        return f"{reason}, so runs are compared by {self.metric} ({direction} is better)"
+        return f"{reason}; {self.metric} ({direction} is better) does not, and is compared instead"
 
 
 def compare(tasks: Sequence[Mapping[str, Any]]) -> Comparison:

@@ -120,7 +120,8 @@ class Rendezvous:
             reward = -mean_{i<j} min(d_ij, R) / R - 0.001 mean(action^2),  R = visibility_radius
 
         Distances d_ij are those after the move. The move clips actions to [-1, 1], the reward uses unclipped actions.
-        The reward and the metric `distance` depend on R; `final_center_distance`, see `swarm.center_distance`, does not.
+        The reward and the metric `distance` depend on R. The metric `final_center_distance` does not; see
+        `swarm.center_distance`.
         """
         state = self.motion.move(self.space, state, action).replace(time=state.time + 1)
         is_present = swarm.is_present(state.active_agents, self.num_agents)
