@@ -243,7 +243,7 @@ def test_evaluations_that_are_not_finite_are_left_out_and_told(runs, tmp_path, c
 def test_each_seed_is_shown_if_asked_for(runs, overrides, count):
     assert plot.main([str(runs), "out=x.svg", *overrides]) == 0
     assert plot.Path("x.svg").read_text().count("stroke-width: 0.6;") == count
-    assert ("and each seed" in text_of("x.svg")) == (count > 0)
+    assert ("thin: each seed" in text_of("x.svg")) == (count > 0)
 
 
 def test_many_series_share_no_color_and_marker():

@@ -206,7 +206,7 @@ def plot_figure(figure: Figure, measured: Mapping[str, Measured], out: Path) -> 
         label = "return of an episode"
         plot = Plot("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
         plots.draw(out / f"{name}.png", plot)
-        replace_text(out / f"{figure.name}.csv", plots.table(plot))
+        replace_text(out / f"{figure.name}.csv", plots.table([plot]))
         written.append(out / f"{name}.png")
     return [*written, out / f"{figure.name}.csv"]
 
