@@ -14,6 +14,7 @@ CAPTION_SIZE = 8.0  # points
 SYMBOL = 10  # characters that the symbol of an entry and the space between columns take
 MAX_COLUMNS = 4
 MAX_SHARE = 0.8  # of the height of the plot, for the legend
+REST = "... and {} more in the CSV file"  # last entry of a legend that does not fit
 STYLE: dict[str, Any] = {"frameon": False, "labelspacing": 0.35}
 
 
@@ -39,7 +40,7 @@ def draw_inside(figure: "Figure", axes: "Axes", handles: Sequence, labels: Seque
 def draw_below(figure: "Figure", handles: Sequence, labels: Sequence[str], caption: str) -> None:
     """Enlarge the figure, and draw caption and legend below its axes, in as many columns as fit.
 
-    Entries that do not fit even in small text are counted in a last entry.
+    If the entries do not fit even in small text, they are cut to one line each, and a last entry counts the others.
     """
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
@@ -74,9 +75,9 @@ def _cut(labels: Sequence[str], width: float, height: float) -> list[str]:
     size = SIZES[-1]
     room = num_characters(width, size) - SYMBOL
     short = [label if len(label) <= room else f"{label[: room - 3]}..." for label in labels]
-    _, columns = _arrange(short, width, size)
+    _, columns = _arrange([*short, REST.format(len(short))], width, size)
     kept = max(1, int(height / _line_height(size)) * columns - 1)
-    return [*short[:kept], f"... and {len(labels) - kept} more"]
+    return [*short[:kept], REST.format(len(short) - kept)]
 
 
 def _line_height(size: float) -> float:

@@ -204,14 +204,15 @@ def _styles(panels: Sequence[Plot]) -> dict[str, dict[str, Any]]:
     ours = [series for plot in panels for series in plot.series if not series.is_reference]
     values = list(dict.fromkeys(series.color_by for series in ours if series.color_by))
     palette = dict(zip(values, _palette(len(values)), strict=True))
-    styles = {}
-    for number, series in enumerate({series.label: series for series in ours}.values()):
+    styles, by_label = {}, {series.label: series for series in ours}
+    linewidth, size = (1.8, 4) if len(by_label) <= len(COLORS) else (1.2, 3)
+    for number, series in enumerate(by_label.values()):
         if series.color_by:
-            styles[series.label] = {"color": palette[series.color_by], "linewidth": 1.4}
+            styles[series.label] = {"color": palette[series.color_by], "linewidth": linewidth}
         else:
             marker = MARKERS[(number + number // len(COLORS)) % len(MARKERS)]  # differs when colors repeat
-            style = {"color": COLORS[number % len(COLORS)], "linewidth": 1.8, "marker": marker, "markersize": 4}
-            styles[series.label] = style
+            style = {"color": COLORS[number % len(COLORS)], "marker": marker, "markersize": size}
+            styles[series.label] = style | {"linewidth": linewidth}
         styles[series.label]["label"] = series.color_by or _entry(series, panels)
     return styles
 
@@ -268,7 +269,7 @@ def _draw_line(axes: "Axes", series: Series, is_step: bool, band_alpha: float, s
 def _draw_frame(axes: "Axes", plot: Plot, width: float, height: float) -> None:
     axes.set_title(legends.fit_text(plot.title, width, 11.0), loc="left", fontsize="large")
     axes.set_xlabel(plot.x_name)
-    axes.set_ylabel(legends.fit_text(plot.y_label, height, 8.0))
+    axes.set_ylabel(legends.fit_text(plot.y_label, height, 7.0))
     if "x" in plot.log:
         _set_logarithmic(axes, "x", _x_values(plot))
     if "y" in plot.log:

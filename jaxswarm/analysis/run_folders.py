@@ -82,7 +82,8 @@ def group(folders: Sequence[RunFolder], keys: Sequence[str] = ()) -> dict[str, l
     all_fields = [members[0].config for members in groups]
     if keys:
         full_keys = [resolve("labels", key, all_fields) for key in keys]
-        labels = [", ".join(setting(fields, key) for key in full_keys) for fields in all_fields]
+        texts = [settings(key, all_fields) for key in full_keys]
+        labels = [", ".join(parts) for parts in zip(*texts, strict=True)]
         twice = next((text for text in labels if labels.count(text) > 1), None)
         if twice is not None:
             same = [repr(full) for full, text in zip(label(all_fields), labels, strict=True) if text == twice]
@@ -112,9 +113,10 @@ def resolve(option: str, key: str, all_fields: Sequence[Fields]) -> str:
     raise ConfigError(f"{option}: must be {accepted}, got {key!r}")
 
 
-def setting(fields: Fields, key: str) -> str:
-    """Return a setting as "key=value", without the name of its part."""
-    return f"{_short(key, {key})}={_text(fields[key]) if key in fields else 'unset'}"
+def settings(key: str, all_fields: Sequence[Fields]) -> list[str]:
+    """Return a setting of each config as "key=value", without the name of its part. Absolute paths are shortened."""
+    values = [_text(fields[key]) if key in fields else "unset" for fields in _with_short_paths(all_fields)]
+    return [f"{_short(key, {key})}={value}" for value in values]
 
 
 def shortened(paths: Sequence[str]) -> dict[str, str]:

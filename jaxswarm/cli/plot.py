@@ -49,15 +49,15 @@ def main(arguments: Sequence[str]) -> int:
         raise ConfigError(f"reference: must be used with runs of one task, got {len(panels)} panels")
     kind = KINDS[options.kind]
     drawn = [kind.plot(panel, options) for panel in panels]
-    notes = [(series.label, series.note) for plot in drawn for series in plot.series]
-    if len({note for _, note in notes}) == 1:  # the caption has the number of seeds
+    notes = [(plot.title, series.label, series.note) for plot in drawn for series in plot.series]
+    if len({note for *_, note in notes}) == 1:  # the caption has the number of seeds
         drawn = [dataclasses.replace(plot, series=_without_notes(plot.series)) for plot in drawn]
     drawn = [dataclasses.replace(plot, series=[*plot.series, *references], log=options.log) for plot in drawn]
     caption = _smoothed(kind.caption(panels, options), options)
     caption += "; dashed: references, median and quartiles" if references else ""
     _write(out, drawn, caption, options)
-    for label, note in notes:
-        print(f"{label}: {note}")
+    for title, label, note in notes:
+        print(f"{title}; {label}: {note}" if len(panels) > 1 else f"{label}: {note}")
     print(f"wrote {out}\nwrote {out.with_suffix('.csv')}")
     return 0
 
@@ -129,7 +129,8 @@ def _column(folders: Sequence[RunFolder], options: Options) -> tuple[str, str]:
     comparison = compare(tasks)
     column = f"eval/{comparison.metric}"
     if comparison.settings and not any(column in row for folder in folders for row in folder.rows[:1]):
-        _warn(f"{comparison.explain()}; the runs have no column {column}, so the plot shows {RETURN}")
+        settings = ", ".join(comparison.settings)
+        _warn(f"returns with different values of {settings} are not comparable, but the runs have no column {column}")
         return RETURN, NAMES[RETURN]
     if comparison.settings:
         print(comparison.explain())
@@ -139,8 +140,8 @@ def _column(folders: Sequence[RunFolder], options: Options) -> tuple[str, str]:
 def _colors(groups: Mapping[str, Sequence[RunFolder]], options: Options) -> dict[str, str]:
     if not options.color:
         return {}
-    key = runs.resolve("color", options.color, [members[0].config for members in groups.values()])
-    return {label: runs.setting(members[0].config, key) for label, members in groups.items()}
+    all_fields = [members[0].config for members in groups.values()]
+    return dict(zip(groups, runs.settings(runs.resolve("color", options.color, all_fields), all_fields), strict=True))
 
 
 def _curve(panel: Panel, options: Options) -> Plot:
@@ -191,7 +192,8 @@ def _profile(panel: Panel, options: Options) -> Plot:
 def _profile_caption(panels: Sequence[Panel], options: Options) -> str:
     groups = [seeds for panel in panels for seeds in panel.curves.values()]
     ends, counts = [curve.x[-1] for seeds in groups for curve in seeds], {len(seeds) for seeds in groups}
-    each = f"each of {plots.seed_count(counts.pop())}" if len(counts) == 1 else "each seed"
+    each = "the one seed of each line" if counts == {1} else "each seed"
+    each = f"each of {counts.pop()} seeds" if len(counts) == 1 and counts != {1} else each
     caption = f"Last evaluation of {each}, at {_amount(max(ends), options.x)}"
     caption += f" (the first to end: {_amount(min(ends), options.x)})" if min(ends) < max(ends) else ""
     return caption + ("; 95 % stratified bootstrap intervals" if max(map(len, groups)) > 1 else "")
