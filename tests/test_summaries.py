@@ -81,6 +81,7 @@ def test_summaries_are_written_as_csv_and_latex(tmp_path):
     assert latex.count("\\toprule") == 1
     assert r"a\_1 & " in latex
     assert r"b \& c & $-$" in latex
+    assert r"d & -- & -- & -- & 0" in latex
     assert latex.count(" & ") == 4 * 4 + 0
 
 

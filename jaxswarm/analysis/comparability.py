@@ -50,10 +50,12 @@ def compare(tasks: Sequence[Mapping[str, Any]]) -> Comparison:
     if not settings:
         return Comparison()
     fitting = [candidate for candidate in candidates if set(settings) <= set(candidate.settings)]
-    return Comparison(*fitting[0][::2], settings) if fitting else Comparison(settings=settings)
+    if not fitting:
+        return Comparison(settings=settings)
+    return Comparison(fitting[0].metric, fitting[0].is_higher_better, settings)
 
 
 def _declared(names: set[str | None]) -> tuple[Comparable, ...]:
     """Return the metrics that a task declares; none for several tasks."""
-    name = names.pop() if len(names) == 1 else None
-    return getattr(registries()["task"].get(name), "comparable_metrics", ())
+    classes = [registries()["task"].get(name) for name in names if name]
+    return getattr(classes[0], "comparable_metrics", ()) if len(names) == len(classes) == 1 else ()

@@ -121,7 +121,7 @@ def draw_panels(
     is_small = layout.width / num_columns < SMALL_PANEL
     with plot_settings(SETTINGS | {"font.size": 8 if is_small else 10}):
         figure = Figure(figsize=(layout.width, num_rows * height), layout="constrained")
-        all_axes = figure.subplots(num_rows, num_columns, squeeze=False).ravel()
+        all_axes = figure.subplots(num_rows, num_columns, squeeze=False).ravel().tolist()
         for axes in all_axes[len(panels) :]:
             axes.remove()
         styles = _styles(panels)

@@ -114,7 +114,10 @@ def latex(lines: Sequence[Line]) -> str:
     """Return lines as a LaTeX table."""
     heads, *rows = _cells(lines)
     begin, end = rf"\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}", r"\end{tabular}"
-    rows = [[_escaped(label), *[cell.replace("-", "$-$") for cell in cells]] for label, *cells in rows]
+    rows = [
+        [_escaped(label), *["--" if cell == "-" else cell.replace("-", "$-$") for cell in cells]]
+        for label, *cells in rows
+    ]
     head, *body = (" & ".join(row) + r" \\" for row in [[_escaped(cell) for cell in heads], *rows])
     return COMMENT + "\n".join([begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", end]) + "\n"
 
@@ -134,16 +137,18 @@ def _cells(lines: Sequence[Line]) -> list[list[str]]:
     counts = [name for name in others if name in ("seeds", "diverged")]
     rows = [[label, *HEADS, *counts]]
     for line in lines:
-        cells = [_interval(*[line[name] for name in names]) for names in HEADS.values()]
+        cells = [
+            _interval(*[line[name] for name in names], is_probability="p_" in names[0]) for names in HEADS.values()
+        ]
         rows.append([str(line[label]), *cells, *[str(line[name]) for name in counts]])
     return rows
 
 
-def _interval(value: float, low: float, high: float) -> str:
-    """Format a value with its interval, all with the decimals that give the value at least three digits."""
+def _interval(value: float, low: float, high: float, is_probability: bool) -> str:
+    """Format a value with its interval: a probability with two decimals, other values with at least three digits."""
     if math.isnan(value):
         return "-"
-    decimals = _decimals(value)
+    decimals = 2 if is_probability else _decimals(value)
     bounds = "" if math.isnan(low) else f" [{low:.{decimals}f}, {high:.{decimals}f}]"
     return f"{value:.{decimals}f}{bounds}"
 
