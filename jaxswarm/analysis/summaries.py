@@ -114,10 +114,7 @@ def latex(lines: Sequence[Line]) -> str:
     """Return lines as a LaTeX table."""
     heads, *rows = _cells(lines)
     begin, end = rf"\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}", r"\end{tabular}"
-    rows = [
-        [_escaped(label), *["--" if cell == "-" else cell.replace("-", "$-$") for cell in cells]]
-        for label, *cells in rows
-    ]
+    rows = [[_escaped(label), *map(_latex_number, cells)] for label, *cells in rows]
     head, *body = (" & ".join(row) + r" \\" for row in [[_escaped(cell) for cell in heads], *rows])
     return COMMENT + "\n".join([begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", end]) + "\n"
 
@@ -137,9 +134,7 @@ def _cells(lines: Sequence[Line]) -> list[list[str]]:
     counts = [name for name in others if name in ("seeds", "diverged")]
     rows = [[label, *HEADS, *counts]]
     for line in lines:
-        cells = [
-            _interval(*[line[name] for name in names], is_probability="p_" in names[0]) for names in HEADS.values()
-        ]
+        cells = [_interval(*[line[name] for name in names], "p_" in names[0]) for names in HEADS.values()]
         rows.append([str(line[label]), *cells, *[str(line[name]) for name in counts]])
     return rows
 
@@ -164,6 +159,10 @@ def _csv(lines: Sequence[Line]) -> str:
     writer.writeheader()
     writer.writerows([{name: "" if x != x else x for name, x in line.items()} for line in lines])  # noqa: PLR0124
     return buffer.getvalue()
+
+
+def _latex_number(cell: str) -> str:
+    return "--" if cell == "-" else cell.replace("-", "$-$")
 
 
 def _escaped(label: str) -> str:
