@@ -364,7 +364,7 @@ def test_a_legend_of_many_labels_is_not_taller_than_the_plot(size, length):
     assert figure.get_figheight() <= 2 * height
 
 
-@pytest.mark.parametrize("option", ["size=big", "size=3x", "size=0.1", "columns=0", "color=colour", "labels=name"])
+@pytest.mark.parametrize("option", ["size=big", "size=3x", "size=0.1", "columns=0", "color=hue", "labels=name"])
 def test_a_wrong_size_or_key_is_an_error(runs, capsys, option):
     assert plot.main([str(runs), option]) == 2
     assert f"{option.partition('=')[0]}: must be" in capsys.readouterr().err
