@@ -19,8 +19,8 @@ RETURN = "eval/return"
 SECONDS_FOR_SPACE = 60.0  # how long training waits for space on a full disk
 Row = dict[str, Any]  # row of metrics.csv by column; empty cells are NaN
 
-INTEGERS = ("update", "agent_steps", "seed")
-LEADING = ("update", "agent_steps", "wall_seconds", "seed", "eval/return", "eval/return_std")
+INTEGERS = ("update", "agent_steps", "env_steps", "seed")
+LEADING = ("update", "agent_steps", "env_steps", "wall_seconds", "seed", "eval/return", "eval/return_std")
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -74,6 +74,12 @@ def wait_for_space(write: Callable[[], None], folder: Path) -> None:
 def read_text(path: Path) -> str:
     """Return the content of a text file, with or without a byte order mark; a missing file is empty."""
     return path.read_text(encoding="utf-8-sig") if path.exists() else ""
+
+
+def size_text(path: Path) -> str:
+    """Return the size of a file with its unit, such as "12 kB" or "3.4 MB"."""
+    size = path.stat().st_size
+    return f"{size / 1e6:.1f} MB" if size >= 999_500 else f"{size / 1e3:.0f} kB" if size >= 999.5 else f"{size} bytes"
 
 
 def is_vacant(folder: Path) -> bool:

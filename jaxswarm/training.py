@@ -77,9 +77,14 @@ class Experiment:
         return self.reset_pool or math.ceil(self.num_steps / self.task.episode_length)
 
     @property
+    def env_steps_per_update(self) -> int:
+        """Environment steps of one update: environments times steps."""
+        return self.num_envs * self.num_steps
+
+    @property
     def agent_steps_per_update(self) -> int:
         """Agent steps of one update: environments times steps times agents."""
-        return self.num_envs * self.num_steps * self.task.num_agents
+        return self.env_steps_per_update * self.task.num_agents
 
 
 def _has(part: Any, method: str) -> bool:

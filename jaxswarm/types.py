@@ -1,7 +1,7 @@
 """Data types that all modules share."""
 
 import dataclasses
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,18 @@ from jaxtyping import Array, Bool, Float
 Key = jax.Array  # a typed PRNG key
 Metrics = dict[str, Array]  # a flat dict of scalars
 T = TypeVar("T")
+
+
+class Comparable(NamedTuple):
+    """Metric that compares runs of a task if some settings differ between them.
+
+    A task lists such metrics in the class attribute `comparable_metrics`, the best one first. `settings` are the fields
+    of the task that change the scale of the return, but not that of the metric.
+    """
+
+    metric: str
+    settings: tuple[str, ...]
+    is_higher_better: bool = False
 
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:

@@ -317,7 +317,7 @@ def test_claims_about_the_beginning_need_no_more_than_that(kind, fields, outcome
 
 @pytest.mark.parametrize(
     ("spread", "room", "outcome"),
-    [(0.0, 0.5, "reproduced"), (5.0, 0.5, "not enough runs"), (0.1, -1.0, "not reproduced")],
+    [(0.0, 0.5, "reproduced"), (5.0, 0.5, "seeds disagree"), (0.1, -1.0, "not reproduced")],
 )
 def test_verdicts_require_that_bootstrapped_seeds_agree(spread, room, outcome):
     rng, x = np.random.default_rng(0), np.arange(1.0, 101)
@@ -490,7 +490,9 @@ def test_a_figure_is_run_continued_and_reported(tmp_path, monkeypatch, capsys):
     assert lengths == [3, 3, 4, 4]
     folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}
     assert len(folders) == 2
-    assert {"fig_6_15.png", "fig_6_15.csv", "fig_6_15.md"} <= {path.name for path in tmp_path.iterdir()}
+    names = ("fig_6_15", "fig_6_15_summary")
+    files = {"fig_6_15.png", "fig_6_15.md", "fig_6_15_summary.tex", *(f"{name}.csv" for name in names)}
+    assert files <= {path.name for path in tmp_path.iterdir()}
     monkeypatch.setattr(figures, "names", lambda: ["fig_6_5", "fig_6_15"])
     assert program.main(["all", f"dir={tmp_path}", f"out={tmp_path / 'out'}", *TINY]) == 0
     report = (tmp_path / "out" / "report.md").read_text()

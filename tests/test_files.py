@@ -108,3 +108,9 @@ def test_a_folder_without_results_is_removed(tmp_path):
             if content:
                 (tmp_path / name / "file").write_text(content)
     assert [folder.name for folder in tmp_path.iterdir()] == ["full"]
+
+
+@pytest.mark.parametrize(("size", "text"), [(0, "0 bytes"), (999, "999 bytes"), (12_345, "12 kB"), (999_600, "1.0 MB")])
+def test_sizes_of_files_have_a_unit_that_fits(tmp_path, size, text):
+    (tmp_path / "file").write_bytes(bytes(size))
+    assert files.size_text(tmp_path / "file") == text

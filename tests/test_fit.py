@@ -70,6 +70,7 @@ def test_chunks_are_the_single_program_bit_by_bit(undisturbed):
     assert metrics.pop("is_finite").all()
     assert [row["update"] for row in rows] == [0, 3, 6, 8]
     assert [row["agent_steps"] for row in rows] == [0, 72, 144, 192]
+    assert [row["env_steps"] for row in rows] == [row["agent_steps"] // EXPERIMENT.task.num_agents for row in rows]
     for name, values in metrics.items():
         found = [row[name] for row in rows]
         if name.startswith("eval/"):

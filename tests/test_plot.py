@@ -4,10 +4,11 @@ import xml.etree.ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from jaxswarm import config as configs
 from jaxswarm import files
-from jaxswarm.analysis import plots
+from jaxswarm.analysis import legends, plots
 from jaxswarm.analysis.curves import Line
 from jaxswarm.cli import plot
 
@@ -56,6 +57,11 @@ def read(path):
 def text_of(path):
     """Return all text of an SVG plot."""
     return " ".join(" ".join(element.itertext()) for element in xml.etree.ElementTree.parse(path).iter())
+
+
+def texts_of(path):
+    """Return the texts of an SVG plot."""
+    return [element.text for element in xml.etree.ElementTree.parse(path).iter() if (element.text or "").strip()]
 
 
 def test_a_plot_of_a_folder_of_runs_says_how_many_seeds_and_what_the_band_is(runs, capsys):
@@ -245,7 +251,7 @@ def test_evaluations_that_are_not_finite_are_left_out_and_told(runs, tmp_path, c
 def test_each_seed_is_shown_if_asked_for(runs, overrides, count):
     assert plot.main([str(runs), "out=x.svg", *overrides]) == 0
     assert plot.Path("x.svg").read_text().count("stroke-width: 0.6;") == count
-    assert ("and each seed" in text_of("x.svg")) == (count > 0)
+    assert ("thin: each seed" in text_of("x.svg")) == (count > 0)
 
 
 def test_many_series_share_no_color_and_marker():
@@ -258,3 +264,109 @@ def test_many_series_share_no_color_and_marker():
         patch.setattr(plots, "_draw_line", lambda *arguments: (styles.append(arguments[-1]), original(*arguments)))
         plots.draw(plot.Path("many.svg"), many)
     assert len({(style["color"], style["marker"]) for style in styles}) == 20
+
+
+def write_run(folder, overrides, seeds=(0,), **columns):
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(configs.dump(configs.compose(overrides)))
+    for seed in seeds:
+        for i in range(3):
+            row = {"update": i, "agent_steps": i * 500, "wall_seconds": 1.0 * i, "seed": seed, "eval/return": -9.0 + i}
+            files.append_row(folder / "metrics.csv", row | columns)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "caption"),
+    [
+        ([(0,)], "One seed"),
+        ([(0,), (1,)], "One seed per line"),
+        ([(0, 1, 2), (0, 1, 2)], "Median and quartiles over 3 seeds"),
+        ([(0, 1), (0,)], "Median and quartiles over seeds; lines of one seed have no band"),
+    ],
+)
+def test_the_caption_fits_the_numbers_of_seeds(tmp_path, seeds, caption):
+    for number, some in enumerate(seeds):
+        write_run(tmp_path / "runs" / str(number), [f"learner.learning_rate={1e-3 * (1 + number)}"], some)
+    assert plot.main(["runs", "out=x.svg"]) == 0
+    texts = texts_of("x.svg")
+    assert caption in texts
+    is_in_legend = len(set(map(len, seeds))) > 1
+    assert any("seed" in text for text in texts if text != caption) == is_in_legend
+
+
+def test_each_task_and_each_reward_has_a_panel(tmp_path, capsys):
+    for task in ("rendezvous", "pursuit", "pursuit_multi"):
+        write_run(tmp_path / "runs" / task, [f"task={task}"])
+    assert plot.main(["runs", "out=x.svg", "title=All tasks", "columns=2", "size=6x2"]) == 0
+    panels = ["pursuit, mean, ppo, reward=distance", "pursuit, mean, ppo, reward=catches", "rendezvous, mean, ppo"]
+    assert list(dict.fromkeys(row["panel"] for row in read("x.csv"))) == panels
+    assert all(title in text_of("x.svg") for title in ["All tasks", *panels])
+    assert f"{panels[-1]}; rendezvous, mean, ppo: 1 seed" in capsys.readouterr().out
+    assert plot.main(["runs", "reference=" + str(tmp_path / "x.csv")]) == 2
+
+
+def test_runs_with_other_visibility_radii_show_a_metric_that_does_not_depend_on_them(tmp_path, capsys):
+    for radius in (10, 50):
+        column = {"eval/final_center_distance": radius / 10}
+        write_run(tmp_path / "new" / str(radius), [f"visibility_radius={radius}"], **column)
+        write_run(tmp_path / "old" / str(radius), [f"visibility_radius={radius}"])
+    assert plot.main(["new", "out=x.svg"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out.startswith("the return depends on task.visibility_radius; final_center_distance (lower")
+    assert {row["y_name"] for row in read("x.csv")} == {"median of eval/final_center_distance"}
+    assert "eval/final_center_distance (lower is better)" in text_of("x.svg")
+    assert plot.main(["new", "out=x.svg", "y=eval/return"]) == 0
+    assert {row["y_name"] for row in read("x.csv")} == {"median of eval/return"}
+    assert plot.main(["old", "out=x.svg"]) == 0
+    assert "not comparable, but the runs have no column eval/final_center_distance" in capsys.readouterr().err
+    assert {row["y_name"] for row in read("x.csv")} == {"median of eval/return"}
+
+
+def test_labels_are_settings_or_names_of_folders(runs, tmp_path, capsys):
+    for number, name in enumerate(("mean", "max")):
+        write_run(tmp_path / "warm" / str(number), [f"init_from={runs / name}", f"aggregator={name}"], (number,))
+    assert plot.main(["warm", "out=x.svg", "labels=init_from"]) == 0
+    assert {row["series"] for row in read("x.csv")} == {"init_from=mean", "init_from=max"}
+    assert plot.main(["warm", str(runs), "out=x.svg", "labels=run"]) == 0
+    assert {row["series"] for row in read("x.csv")} == {"0", "1", "mean", "max"}
+    capsys.readouterr()
+    assert plot.main(["warm", "out=x.svg", "labels=learning_rate"]) == 2
+    err = capsys.readouterr().err
+    assert "labels: must differ between groups, got 'learning_rate=" in err
+    assert "aggregator=mean, init_from=mean" in err
+
+
+def test_lines_are_colored_by_a_setting(tmp_path):
+    for number in range(10):
+        overrides = [f"learner.learning_rate={1e-3 * (1 + number // 2)}", f"task.num_agents={5 + number % 2}"]
+        write_run(tmp_path / "runs" / str(number), overrides)
+    assert plot.main(["runs", "out=x.svg", "color=learning_rate"]) == 0
+    texts = texts_of("x.svg")
+    assert all(texts.count(f"learning_rate={x}") == 1 for x in ("0.001", "0.002", "0.003", "0.004", "0.005"))
+    assert not any("num_agents" in text for text in texts)
+
+
+@pytest.mark.parametrize("size", ["", "size=3.3", "size=3.3x2"])
+@pytest.mark.parametrize("length", [10, 150])
+def test_a_legend_of_many_labels_is_not_taller_than_the_plot(size, length):
+    line = Line(*np.arange(12.0).reshape(4, 3), np.ones(3, int))
+    series = [plots.Series(f"group {i} ".ljust(length, "x"), line) for i in range(40)]
+    layout = plot.Options(size=size.removeprefix("size=")).layout
+    _, _, height = layout.grid(1)
+    figures = []
+    with pytest.MonkeyPatch.context() as patch:
+        draw_below = legends.draw_below
+        patch.setattr(legends, "draw_below", lambda figure, *rest: (figures.append(figure), draw_below(figure, *rest)))
+        plots.draw_panels(plot.Path("many.png"), [plots.Plot("curve", series, "update", "y", "y")], "", layout=layout)
+    (figure,) = figures
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    (legend,) = figure.legends
+    assert legend.get_window_extent(renderer).height <= figure.axes[0].get_window_extent(renderer).height * 1.3
+    assert legend.get_window_extent(renderer).width <= figure.bbox.width
+    assert figure.get_figheight() <= 2 * height
+
+
+@pytest.mark.parametrize("option", ["size=big", "size=3x", "size=0.1", "columns=0", "color=hue", "labels=name"])
+def test_a_wrong_size_or_key_is_an_error(runs, capsys, option):
+    assert plot.main([str(runs), option]) == 2
+    assert f"{option.partition('=')[0]}: must be" in capsys.readouterr().err

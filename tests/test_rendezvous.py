@@ -292,3 +292,16 @@ def test_driving_to_the_first_centroid_scores_ten_to_sixteen():
 def test_impossible_fields_are_named_with_what_is_accepted(field, value, accepted):
     with pytest.raises(ValueError, match=f"{field}: must be {accepted}.*, got {re.escape(repr(value))}"):
         Rendezvous(**{field: value})
+
+
+@pytest.mark.parametrize("torus", [False, True])
+def test_the_distance_to_the_center_does_not_depend_on_the_visibility_radius(torus):
+    metrics = []
+    for radius in (1.0, 100.0):
+        task = Rendezvous(num_agents=4, torus=torus, visibility_radius=radius, episode_length=1)
+        state = task.reset(KEY).replace(active_agents=jnp.array(3))
+        position = jnp.array([[98.0, 50.0], [99.0, 50.0], [1.0, 50.0], [30.0, 20.0]])
+        metrics.append(task.step(KEY, state.replace(position=position), jnp.zeros((4, 2)))[1].metrics)
+    assert metrics[0]["final_distance"] != metrics[1]["final_distance"]
+    expected = np.mean(np.abs(np.array([98, 99, 101 if torus else 1]) - (99 + 1 / 3 if torus else 66)))
+    np.testing.assert_allclose([x["final_center_distance"] for x in metrics], expected, rtol=1e-3)

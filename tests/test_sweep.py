@@ -90,6 +90,9 @@ def test_a_sweep_is_interrupted_resumed_and_summarized(tmp_path, monkeypatch, ca
     assert {line["seeds"] for line in table} == {"2"}
     medians = [float(line["median"]) for line in table]
     assert medians == sorted(medians, reverse=True)
+    assert {line["metric"] for line in table} == {"eval/return"}
+    assert "P(first is better)" in (sweep_dir / "summary.tex").read_text()
+    assert (sweep_dir / "summary_improvement.csv").read_text().count("\n") == 1 + 6 * 5 // 2
     assert (sweep_dir / "curves.png").stat().st_size > 10_000
     folders = sorted(path for path in sweep_dir.iterdir() if path.is_dir())
     for folder in folders:
@@ -157,8 +160,28 @@ def test_runs_with_seeds_that_diverged_come_last():
     rows = [
         [{"update": 4, "seed": s, "eval/return": x} for s, x in enumerate(xs)] for xs in ([9.0], [1.0, 2.0], [3.0, 4.0])
     ]
-    table = sweep.summary([trial(i) for i in range(3)], rows)
-    assert [line["run"] for line in table] == ["run2", "run1", "run0"]
+    summary = sweep.summary([trial(i) for i in range(3)], rows)
+    assert [line["run"] for line in summary.lines] == ["run2", "run1", "run0"]
+    assert [(line["seeds"], line["diverged"]) for line in summary.lines] == [(2, 0), (2, 0), (1, 1)]
+    assert summary.comparison.explain() == ""
+
+
+def test_runs_with_other_visibility_radii_are_sorted_by_a_metric_that_does_not_depend_on_them():
+    runs = [
+        Run.from_config(config.compose([*OVERRIDES, f"visibility_radius={radius}"]), Path(f"radius{radius}"))
+        for radius in (10, 50)
+    ]
+    values = {"eval/return": (-9.0, -1.0), "eval/final_center_distance": (2.0, 4.0)}
+    rows = [[{"update": 4, "seed": s} | {name: x[i] for name, x in values.items()} for s in (0, 1)] for i in (0, 1)]
+    summary = sweep.summary(runs, rows)
+    assert "task.visibility_radius" in summary.comparison.explain()
+    assert [(line["run"], line["metric"], line["median"]) for line in summary.lines] == [
+        ("radius10", "eval/final_center_distance", 2.0),
+        ("radius50", "eval/final_center_distance", 4.0),
+    ]
+    assert summary.lines[1]["p_first"] == 1.0
+    (pair,) = summary.improvements
+    assert (pair["better"], pair["than"], pair["probability"]) == ("radius10", "radius50", 1.0)
 
 
 @pytest.mark.parametrize("where", ["a_file", "/proc/nowhere"])

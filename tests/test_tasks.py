@@ -239,3 +239,11 @@ def test_gradients_are_finite_even_between_agents_at_one_place(task, distance, c
     shape = (NUM_AGENTS, 2)
     offset = distance * jnp.broadcast_to(jnp.arange(NUM_AGENTS, dtype=jnp.float32)[:, None], shape)
     assert jnp.isfinite(slope(task, jnp.full(shape, corner), offset)).all()
+
+
+def test_comparable_metrics_exist_and_depend_on_fields_of_the_task(task):
+    fields = {field.name for field in dataclasses.fields(task)}
+    _, outcome = step(task, KEY, reset(task, KEY), random_actions(task))
+    for metric, settings, _ in task.comparable_metrics:
+        assert metric in outcome.metrics
+        assert set(settings) <= fields

@@ -153,6 +153,16 @@ def bootstrapped(
     return lines
 
 
+def final_levels(
+    curves: Sequence[Curve], start: float, end: float, best_share: float = 1.0
+) -> Float[np.ndarray, " seeds"]:
+    """Return the mean of each seed between two points. Seeds that end before `end` have no value and are left out."""
+    grid, values = on_common_grid(curves)
+    at = np.linspace(start, end, 50)
+    levels = np.array([np.interp(at, grid, seed).mean() for seed in _best(values, best_share)])
+    return levels[np.isfinite(levels)]
+
+
 def num_best(num_seeds: int, share: float) -> int:
     """Return the number of seeds in the best `share` of `num_seeds`: rounded, and at least 1."""
     return max(1, round(share * num_seeds))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxswarm import config as configs
 from jaxswarm.analysis import curves
 from jaxswarm.analysis.curves import Curve
-from jaxswarm.config import ConfigError
+from jaxswarm.config import ConfigError, schema
 from jaxswarm.files import Row, read_rows
 
 # keys that change neither a task nor a policy: seed, length, checkpoints, and times of evaluation
@@ -58,7 +58,10 @@ def read(path: Path) -> RunFolder:
     missing = [name for name in ("update", "agent_steps", "seed") if rows and name not in rows[0]]
     if missing:
         raise ConfigError(f"cannot read {path / 'metrics.csv'}: the file has no column {missing[0]}")
-    return RunFolder(path, fields(nested), rows)
+    flat = fields(nested)
+    if isinstance(num_agents := flat.get("task.num_agents"), int):
+        rows = [{"env_steps": row["agent_steps"] // num_agents} | row for row in rows]  # absent before version 0.2
+    return RunFolder(path, flat, rows)
 
 
 def fields(config: configs.Config) -> Fields:
@@ -66,13 +69,65 @@ def fields(config: configs.Config) -> Fields:
     return {name: x for name, x in configs.flat(config).items() if name not in NOT_COMPARED}
 
 
-def group(folders: Sequence[RunFolder]) -> dict[str, list[RunFolder]]:
-    """Group folders whose compared settings are equal. The keys are labels: the settings that differ between groups."""
-    groups = defaultdict(list)
+def group(folders: Sequence[RunFolder], keys: Sequence[str] = ()) -> dict[str, list[RunFolder]]:
+    """Group folders whose compared settings are equal.
+
+    The keys of the result are labels: the settings that differ between groups, or those in `keys`. Raises a
+    `ConfigError` if `keys` give two groups the same label.
+    """
+    by_settings = defaultdict(list)
     for folder in folders:
-        groups[json.dumps(folder.config, sort_keys=True)].append(folder)
-    labels = label([members[0].config for members in groups.values()])
-    return dict(sorted(zip(labels, groups.values(), strict=True), key=lambda pair: _by_number(pair[0])))
+        by_settings[json.dumps(folder.config, sort_keys=True)].append(folder)
+    groups = list(by_settings.values())
+    all_fields = [members[0].config for members in groups]
+    if keys:
+        full_keys = [resolve("labels", key, all_fields) for key in keys]
+        texts = [settings(key, all_fields) for key in full_keys]
+        labels = [", ".join(parts) for parts in zip(*texts, strict=True)]
+        twice = next((text for text in labels if labels.count(text) > 1), None)
+        if twice is not None:
+            same = [repr(full) for full, text in zip(label(all_fields), labels, strict=True) if text == twice]
+            raise ConfigError(f"labels: must differ between groups, got {twice!r} for {' and '.join(same)}")
+    else:
+        labels = label(all_fields)
+    return dict(sorted(zip(labels, groups, strict=True), key=lambda pair: by_number(pair[0])))
+
+
+def each_run(folders: Sequence[RunFolder]) -> dict[str, list[RunFolder]]:
+    """Return a group for each folder, labeled by the shortest end of its path that no other folder has."""
+    names = shortened([str(folder.path.resolve()) for folder in folders])
+    return {names[str(folder.path.resolve())]: [folder] for folder in folders}
+
+
+def resolve(option: str, key: str, all_fields: Sequence[Fields]) -> str:
+    """Return the full key of a setting: `learner.learning_rate` for `learning_rate`, `task.name` for `task`.
+
+    Raises a `ConfigError` about the option if no config has the key, or if several parts have it.
+    """
+    known = list(dict.fromkeys(name for fields in all_fields for name in fields))
+    found = [name for name in (key, f"{key}.name") if name in known][:1]
+    found = found or [name for name in known if name.rpartition(".")[2] == key != "name"]
+    if len(found) == 1:
+        return found[0]
+    accepted = f"one of {', '.join(found)}" if found else f"a key of the runs{schema.nearest(key, known)}"
+    raise ConfigError(f"{option}: must be {accepted}, got {key!r}")
+
+
+def settings(key: str, all_fields: Sequence[Fields]) -> list[str]:
+    """Return a setting of each config as "key=value", without the name of its part. Absolute paths are shortened."""
+    values = [_text(fields[key]) if key in fields else "unset" for fields in _with_short_paths(all_fields)]
+    return [f"{_short(key, {key})}={value}" for value in values]
+
+
+def shortened(paths: Sequence[str]) -> dict[str, str]:
+    """Return the shortest ends of the paths that differ where the paths differ."""
+    distinct = list(dict.fromkeys(paths))
+    longest = max((len(Path(path).parts) for path in distinct), default=1)
+    for size in range(1, longest + 1):
+        ends = {path: str(Path(*Path(path).parts[-size:])) for path in distinct}
+        if len(set(ends.values())) == len(distinct):
+            return ends
+    return {path: path for path in distinct}
 
 
 def label(configs_of_groups: Sequence[Fields]) -> list[str]:
@@ -80,10 +135,11 @@ def label(configs_of_groups: Sequence[Fields]) -> list[str]:
 
     If a part such as the aggregator differs, the label has only its name, and its fields only if parts of the same
     name differ. If several fields of the network differ and every group uses a preset, the label has the name of the
-    preset. The label of a single group is the names of its parts.
+    preset. Absolute paths are shortened. The label of a single group is the names of its parts.
     """
     if len(configs_of_groups) == 1:
         return [common_name(configs_of_groups) or "runs"]
+    configs_of_groups = _with_short_paths(configs_of_groups)
     texts = [_differences(fields, configs_of_groups) for fields in configs_of_groups]
     presets = _network_presets(configs_of_groups)
     if presets:
@@ -167,6 +223,16 @@ def _differences(fields: Fields, all_fields: Sequence[Fields]) -> dict[str, str]
     return texts
 
 
+def _with_short_paths(all_fields: Sequence[Fields]) -> list[Fields]:
+    """Return the configs with absolute paths, such as that of a warm start, shortened to ends that differ."""
+    paths = [{key: x for key, x in fields.items() if isinstance(x, str) and os.path.isabs(x)} for fields in all_fields]
+    ends = {key: shortened([own[key] for own in paths if key in own]) for key in {key for own in paths for key in own}}
+    return [
+        fields | {key: ends[key][path] for key, path in own.items()}
+        for fields, own in zip(all_fields, paths, strict=True)
+    ]
+
+
 def _network_presets(all_fields: Sequence[Fields]) -> list[str] | None:
     """Return the names of the network presets if several network fields differ and each config uses a preset."""
     keys = {key for fields in all_fields for key in fields if key.startswith("network.")}
@@ -197,7 +263,7 @@ def _text(value: Any) -> str:
     return json.dumps(value, separators=(",", ":")).strip('"')
 
 
-def _by_number(text: str) -> list[str | float]:
+def by_number(text: str) -> list[str | float]:
     """Return a sort key that orders numbers in the text by size."""
     parts = re.split(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)", text)
     return [float(part) if number % 2 else part for number, part in enumerate(parts)]

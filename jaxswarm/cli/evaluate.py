@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +27,9 @@ jaxswarm-eval PATH [key=value ...] [task.KEY=VALUE[,VALUE...] ...]
 
 Evaluates the trained policy of a run folder, prints a table, and writes all results as JSON into the folder. The action
 is the mean of the policy. Each episode has its own start state. If the run has several seeds, the policies of all seeds
-are evaluated. The table shows means over the seeds, and the file also contains the values of each seed.
+are evaluated. The table shows means over the seeds, and the file also contains the values of each seed. If a setting
+differs on which the scale of the return depends, such as task.visibility_radius, one line reports it and the table
+begins with a metric that does not depend on it.
 
 options
   PATH                Run folder. Required.
@@ -116,6 +119,7 @@ def _mean(values: Any) -> float | None:
 
 
 def _report(run_dir: Path, result: dict[str, Any]) -> int:
+    from jaxswarm.analysis.comparability import compare  # noqa: PLC0415
     from jaxswarm.files import replace_text  # noqa: PLC0415
 
     name = f"eval-{result['which']}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -125,20 +129,23 @@ def _report(run_dir: Path, result: dict[str, Any]) -> int:
     seeds = f" of each of {num_seeds} seeds; means over seeds" if num_seeds > 1 else ""
     checkpoint = f"{result['which']} checkpoint, after update {result['update']}"
     print(f"{run_dir}: {checkpoint}; {result['episodes']} episodes{seeds}")
-    print(_table(result["results"]))
+    comparison = compare([one["task"] for one in result["results"]])
+    if comparison.settings:
+        print(comparison.explain())
+    print(_table(result["results"], comparison.metric))
     replace_text(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
     print(f"wrote {path}")
     return 0
 
 
-def _table(results: Sequence[dict[str, Any]]) -> str:
-    """Format a table with a row for each metric, returns first, and a column for each changed task."""
-    metrics = sorted(results[0]["metrics"], key=lambda name: not name.startswith("return"))
+def _table(results: Sequence[dict[str, Any]], first: str) -> str:
+    """Format a table with a row for each metric, `first` and returns at the top, and a column for each changed task."""
+    from jaxswarm.analysis import summaries  # noqa: PLC0415
+
+    metrics = sorted(results[0]["metrics"], key=lambda name: (name != first, not name.startswith("return")))
     rows = [[key, *[str(result["changed"][key]) for result in results]] for key in results[0]["changed"]]
     rows += [[name, *[_cell(result["metrics"][name]) for result in results]] for name in metrics]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    cells = [[x.rjust(width) for x, width in zip(row, widths, strict=True)] for row in rows]
-    return "\n".join("  ".join(["", row[0].ljust(widths[0]), *line[1:]]) for row, line in zip(rows, cells, strict=True))
+    return textwrap.indent(summaries.aligned(rows), "  ")
 
 
 def _cell(value: float | None) -> str:

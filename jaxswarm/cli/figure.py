@@ -18,10 +18,11 @@ jaxswarm-figure FIGURE [seeds=N] [scale=1.0] [series=PATTERN] [dir=runs/figures]
 jaxswarm-figure all [dir=runs/figures] [out=PATH] [key=value ...]
 
 The first form trains all series of a figure of the thesis with the published settings. It writes the figure with the
-thesis's curves overlaid, a table, and a verdict on each claim of the figure. The same command resumes after Ctrl-C.
-Figures share run folders where their series are the same. The second form trains nothing: it reports all finished runs
-and copies their evaluations to out/runs, where later reports find the runs that are not in dir. Sections of an earlier
-report stay if no run of their figure is found.
+thesis's curves overlaid, a table, and a verdict on each claim of the figure. FIGURE_summary.csv and FIGURE_summary.tex
+have medians, interquartile means and probabilities of improvement of the final levels. The same command resumes after
+Ctrl-C. Figures share run folders where their series are the same. The second form trains nothing: it reports all
+finished runs and copies their evaluations to out/runs, where later reports find the runs that are not in dir. Sections
+of an earlier report stay if no run of their figure is found.
 
 options
   seeds=N          Seeds of each series. The default is the number that verdicts need. A larger number later trains
@@ -127,6 +128,7 @@ def _section(figure: Any, runs: dict, found: Sequence[Any], out: Path, overrides
     measured = figures.measure(figure, runs, found, lambda text: print(f"warning: {text}", file=sys.stderr))
     if measured:
         figures.plot_figure(figure, measured, out)
+        figures.write_summary(figure, measured, out)
     return report.section(figure, runs, measured, overrides)
 
 

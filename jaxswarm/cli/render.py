@@ -16,6 +16,7 @@ from jaxswarm.cli.program import (
     wants_help,
 )
 from jaxswarm.config import ConfigError
+from jaxswarm.files import size_text
 
 HELP = """\
 jaxswarm-render PATH... [key=value ...] [task.KEY=VALUE ...]
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
         raise ConfigError(f"out: cannot write to {out}: {error.strerror}") from error
     for film in films:
         print(f"{film.title}: {film.num_frames - 1} steps, return {film.score[-1]:.2f}")
-    print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    print(f"wrote {out} ({size_text(out)})")
     return 0
 
 

@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
@@ -12,14 +13,19 @@ from jaxswarm.cli.program import command, parse_integer, program, split, use_com
 from jaxswarm.config import ConfigError, plugins, renamed
 from jaxswarm.files import claim_folder, is_vacant, read_text, removed_if_empty
 
+if TYPE_CHECKING:
+    from jaxswarm.studies.grid import Summary
+
 HELP = """\
 jaxswarm-sweep key=a,b,c [key=1e-4..1e-3:5log] ... [num_seeds=N] [sweep_dir=PATH]
 jaxswarm-sweep search=NAME [trials=N] [storage=PATH|URL] [key=value ...] [num_seeds=N] [sweep_dir=PATH]
 jaxswarm-sweep resume=PATH
 
 The first form trains every combination of the values, each in its own run folder. Combinations that differ in numbers
-only are vectorized in one compiled program; the others are trained one program after another. It ends with a table,
-summary.csv and curves.png.
+only are vectorized in one compiled program; the others are trained one program after another. It ends with
+a table of final returns, which is also written as summary.csv and summary.tex, the probabilities of improvement of all
+pairs of runs in summary_improvement.csv, and curves.png. If a setting differs on which the scale of the return depends,
+such as task.visibility_radius, the table has a metric of the task that does not depend on it.
 
 The second form searches with Optuna. configs/search/NAME.yaml, or a YAML file, defines the search space. Each trial is
 trained with num_seeds seeds, and the search maximizes the mean return during training. Machines that name the same
@@ -96,13 +102,19 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
             print(f"stopped; resume with: {command('jaxswarm-sweep', f'resume={sweep_dir}')}")
             return signals.exit_code()
         rows |= {run.run_dir: x for run, x in zip(together, of_each, strict=True)}
-    table = grid.summary(runs, [rows[run.run_dir] for run in runs])
-    grid.write_summary(sweep_dir / "summary.csv", table)
-    for line in table:
-        spread = f"{line['median']:10.2f} [{line['q25']:.2f}, {line['q75']:.2f}]"
-        note = f", {line['diverged']} diverged" if line["diverged"] else ""
-        print(f"{spread}  {line['run']}, seeds: {line['seeds']}{note}")
+    _report(sweep_dir, grid.summary(runs, [rows[run.run_dir] for run in runs]))
     return plot.main([str(sweep_dir), f"out={sweep_dir / 'curves.png'}"])
+
+
+def _report(sweep_dir: Path, summary: "Summary") -> None:
+    """Print the summary of a sweep, and write it as CSV and LaTeX."""
+    from jaxswarm.analysis import summaries  # noqa: PLC0415
+
+    explanation = summary.comparison.explain()
+    print(f"\nfinal {summary.lines[0]['metric']} of each run" + (f"; {explanation}" if explanation else ""))
+    print(summaries.text(summary.lines) + "\n")
+    for path in summaries.write(sweep_dir / "summary", summary.lines, summary.improvements):
+        print(f"wrote {path}")
 
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:

@@ -127,11 +127,10 @@ def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool, force:
         print(f"stopped after update {update} of {run.num_updates}; {hint}")
         return signals.exit_code()
     if is_first:
+        print("writing the replay ...", flush=True)
         _write_replay(config, run, update)
     if rows:
-        first, last = (_return_at(rows, rows[index]["update"]) for index in (0, -1))
-        start = "warm start" if run.settings.init_from else "untrained"
-        print(f"done: {update} updates, return {last} ({start} {first})")
+        print(f"done: {update} updates, {_result(rows, 'warm start' if run.settings.init_from else 'untrained')}")
     print(f"{_files(run_dir)}\nnext: {command('jaxswarm-eval', str(run_dir), 'episodes=100')}")
     return 0
 
@@ -145,11 +144,24 @@ def _write_replay(config: Config, run: Any, update: int) -> None:
     render.write_replay(run.folder, run.experiment, render.of_seed(found.params, 0), update=update)
 
 
-def _return_at(rows: Sequence[dict[str, Any]], update: int) -> str:
-    """Format the return of an evaluation; for several seeds, the median and the quartiles."""
+def _result(rows: Sequence[dict[str, Any]], start: str) -> str:
+    """Format the last and the first evaluation return, and the mean training return between the last two evaluations.
+
+    The training return is that of sampled actions. It is left out if no episode ended between these evaluations.
+    """
+    evaluation = f"evaluation return {_return_at(rows, -1)} ({start} {_return_at(rows, 0)})"
+    training = _return_at(rows, -1, "train/return")
+    return evaluation + (f", training return {training}" if training else "")
+
+
+def _return_at(rows: Sequence[dict[str, Any]], index: int, name: str = "eval/return") -> str:
+    """Format the return of an evaluation, or "" without one; for several seeds, the median and the quartiles."""
     import numpy as np  # noqa: PLC0415
 
-    returns = [row["eval/return"] for row in rows if row["update"] == update]
+    returns = [row.get(name, np.nan) for row in rows if row["update"] == rows[index]["update"]]
+    returns = [x for x in returns if np.isfinite(x)]
+    if not returns:
+        return ""
     low, median, high = np.percentile(returns, [25, 50, 75])
     return f"{median:.2f}" if len(returns) == 1 else f"{median:.2f} [{low:.2f}, {high:.2f}] over {len(returns)} seeds"
 

@@ -26,6 +26,7 @@ class Measured:
     reference: Line
     end: float  # agent steps at which the last tenth, the final level, ends
     bootstrapped: tuple[Line, ...] = ()  # the line of each bootstrap resample of the seeds
+    finals: Points = dataclasses.field(default_factory=lambda: np.empty(0))  # final level of each seed
 
     @property
     def is_cut(self) -> bool:
@@ -100,7 +101,7 @@ class Verdict:
     """Outcome of a claim, with its number in our curves and in the thesis; NaN if a number is unknown."""
 
     claim: Claim
-    outcome: str  # reproduced, not reproduced, not enough runs, run was cut
+    outcome: str  # reproduced, not reproduced, not enough runs, seeds disagree, run was cut
     here: float
     thesis: float
     num_seeds: int
@@ -121,10 +122,10 @@ def judge(claim: Claim, ours: Mapping[str, Measured], theirs: Mapping[str, Measu
     num_seeds = min(one.num_seeds_at(claim.needs(one)) for one in series)
     if any(one.is_cut_before(claim.needs(one)) for one in series):
         outcome = "run was cut"
-    elif (
-        num_seeds < enough or np.mean([claim.holds(x) == claim.holds(here) for x in [here, *bootstrapped]]) < CERTAINTY
-    ):
+    elif num_seeds < enough:
         outcome = "not enough runs"
+    elif np.mean([claim.holds(x) == claim.holds(here) for x in [here, *bootstrapped]]) < CERTAINTY:
+        outcome = "seeds disagree"
     else:
         outcome = "reproduced" if claim.holds(here) else "not reproduced"
     numbers = np.nan_to_num(bootstrapped, nan=math.inf, posinf=math.inf)  # NaN: the level is never reached

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxswarm import config as configs
 from jaxswarm import files
-from jaxswarm.analysis import curves, plots, run_folders
+from jaxswarm.analysis import curves, plots, run_folders, summaries
 from jaxswarm.analysis.curves import Line
 from jaxswarm.analysis.plots import Plot, Series
 from jaxswarm.analysis.run_folders import RunFolder
@@ -162,7 +162,9 @@ def measure(
             bootstrapped = tuple(_cut_line(one, end) for one in bootstrapped)
             reference = figure.references.get(series)
             end = min(end, float(reference.x[-1])) if reference else end
-            measured[series] = Measured(line, reference or line, end, bootstrapped)
+            last = min(end, line.x[-1])
+            finals = curves.final_levels(shifted, (1 - claims.LAST) * last, last, figure.best_share)
+            measured[series] = Measured(line, reference or line, end, bootstrapped, finals)
     return measured
 
 
@@ -206,9 +208,24 @@ def plot_figure(figure: Figure, measured: Mapping[str, Measured], out: Path) -> 
         label = "return of an episode"
         plot = Plot("curve", series, "agent_steps", f"median of {RETURN}", label, figure.title, caption, log)
         plots.draw(out / f"{name}.png", plot)
-        replace_text(out / f"{figure.name}.csv", plots.table(plot))
+        replace_text(out / f"{figure.name}.csv", plots.table([plot]))
         written.append(out / f"{name}.png")
     return [*written, out / f"{figure.name}.csv"]
+
+
+def write_summary(figure: Figure, measured: Mapping[str, Measured], out: Path) -> list[Path]:
+    """Write statistics of the final levels of the seeds as CSV and LaTeX, and return the files.
+
+    Seeds that end before their series are left out. The first series is compared with the others.
+    """
+    finals = {name: ours.finals for name, ours in measured.items()}
+    lines = [
+        {"series": name, "seeds": len(values), "agent_steps": min(measured[name].end, measured[name].line.x[-1])}
+        | summaries.summarize(values)
+        | summaries.versus_first(finals, name)
+        for name, values in finals.items()
+    ]
+    return summaries.write(out / f"{figure.name}_summary", lines, summaries.pairs(finals))
 
 
 def _manifest(folder: RunFolder) -> dict[str, Any]:

@@ -129,12 +129,14 @@ class BatchRecorder:
         self._report_diverged()
         self._measure(chunk)
         returns = [x for recorder in self.recorders if (x := recorder.latest_return()) is not None]
-        self.progress.advance(chunk.start + chunk.length, float(np.median(returns)) if returns else None)
+        evaluation = (returns[0][0], float(np.median([x for _, x in returns]))) if returns else None
+        self.progress.advance(chunk.start + chunk.length, evaluation)
 
     def finish(self, update: int, states: TrainState, is_complete: bool) -> None:
         """Save the final states, and evaluate them if training reached its end."""
         evaluation = None
         if is_complete:
+            self.progress.announce("evaluating the final policy")
             evaluation = ensemble.fetch(self.batch, ensemble.evaluate_batch(self.batch, states))
             evaluation = jax.device_get(evaluation)
         states = ensemble.fetch(self.batch, states)

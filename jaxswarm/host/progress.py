@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 SECONDS_BETWEEN_LINES = 10.0  # without a terminal
-NARROW = 72  # columns below which a terminal shows only the update and the return
+NARROW = 72  # columns below which a terminal shows only the update and the evaluation return
 
 
 class Progress:
@@ -24,6 +24,7 @@ class Progress:
         self._last_line = -math.inf
         self._started = time.monotonic()
         self._update = update
+        self._is_narrow = False
         self._bar = self._make_bar() if is_shown else None
 
     def __enter__(self) -> "Progress":
@@ -44,25 +45,34 @@ class Progress:
         elif self._is_shown:
             print(f"compiled in {time.monotonic() - self._started:.0f} s; training ...", flush=True)
 
-    def advance(self, update: int, evaluation: float | None) -> None:
-        """Show that `update` updates are done. `evaluation` is the latest return, or `None` before the first one."""
+    def announce(self, text: str) -> None:
+        """Show what happens after the last update."""
+        if self._bar:
+            self._bar.update(self._task, rate=text, left="")
+        elif self._is_shown:
+            print(f"{text} ...", flush=True)
+
+    def advance(self, update: int, evaluation: tuple[int, float] | None) -> None:
+        """Show that `update` updates are done.
+
+        `evaluation` is the latest one: the number of updates before it, and its return; `None` before the first one.
+        """
         now = time.monotonic()
         self._update = update
         self._first = self._first or (now, update)
         seconds, updates = now - self._first[0], update - self._first[1]
         rate = updates * self._agent_steps_per_update / seconds if updates else math.nan
         left = (self._num_updates - update) * seconds / updates if updates else math.nan
-        return_text = "-" if evaluation is None else f"{evaluation:.1f}"
         rate_text = f"{_short(rate)} agent steps/s" if updates else "measuring speed"
         left_text = f"{_clock(left)} left" if updates else "-:-- left"
         if self._bar:
             self._bar.update(
-                self._task, completed=update, rate=rate_text, evaluation=f"return {return_text}", left=left_text
+                self._task, completed=update, rate=rate_text, evaluation=self._evaluation(evaluation), left=left_text
             )
         elif self._is_shown and (now - self._last_line >= SECONDS_BETWEEN_LINES or update == self._num_updates):
             self._last_line = now
             done = f"update {update}/{self._num_updates}"
-            print(f"{done} · return {return_text} · {rate_text} · {left_text}", flush=True)
+            print(f"{done} · {self._evaluation(evaluation)} · {rate_text} · {left_text}", flush=True)
 
     def warn(self, text: str) -> None:
         """Print a warning, above the bar if there is one."""
@@ -70,6 +80,13 @@ class Progress:
             self._bar.console.print(f"warning: {text}", markup=False, highlight=False)
         elif self._is_shown:
             print(f"warning: {text}", flush=True)
+
+    def _evaluation(self, evaluation: tuple[int, float] | None) -> str:
+        """Format the latest evaluation; a narrow bar has no room for its update."""
+        if evaluation is None:
+            return "no evaluation yet"
+        update, value = evaluation
+        return f"evaluation return {value:.1f}" + ("" if self._is_narrow else f" at update {update}")
 
     def _make_bar(self) -> Any:
         from rich import console, progress  # noqa: PLC0415
@@ -89,9 +106,10 @@ class Progress:
             progress.TextColumn("{task.fields[rate]}"),
             progress.TextColumn("{task.fields[left]}"),
         )
-        columns = essential if screen.width < NARROW else essential + rest
+        self._is_narrow = screen.width < NARROW
+        columns = essential if self._is_narrow else essential + rest
         bar = progress.Progress(*columns, console=screen, refresh_per_second=4, expand=True)
-        fields: Any = {"rate": "compiling", "evaluation": "return -", "left": "-:-- left"}
+        fields: Any = {"rate": "compiling", "evaluation": "no evaluation yet", "left": "-:-- left"}
         self._task = bar.add_task("", total=self._num_updates, completed=self._update, **fields)
         return bar
 

@@ -149,10 +149,10 @@ class Recorder:
                 _save(self._checkpoints, candidate)
         self._best = None
 
-    def latest_return(self) -> float | None:
-        """Return the median over seeds of the latest evaluation, `None` without one."""
+    def latest_return(self) -> tuple[int, float] | None:
+        """Return the update and the median return over seeds of the latest evaluation, `None` without one."""
         latest = [row[RETURN] for row in self.rows if row["update"] == self.rows[-1]["update"]]
-        return float(np.median(latest)) if latest else None
+        return (self.rows[-1]["update"], float(np.median(latest))) if latest else None
 
     @property
     def diverged(self) -> list[int]:
@@ -193,6 +193,7 @@ class Recorder:
             row = {
                 "update": update,
                 "agent_steps": update * self.run.experiment.agent_steps_per_update,
+                "env_steps": update * self.run.experiment.env_steps_per_update,
                 "wall_seconds": wall_seconds,
                 "seed": seed,
             }

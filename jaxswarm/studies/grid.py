@@ -3,9 +3,7 @@
 Runs that differ only in numeric hyperparameters are vectorized in one program; other programs run one after another.
 """
 
-import csv
 import dataclasses
-import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +14,10 @@ import numpy as np
 
 from jaxswarm import config as configs
 from jaxswarm.analysis import run_folders as folders
+from jaxswarm.analysis import summaries
+from jaxswarm.analysis.comparability import Comparison, compare
 from jaxswarm.config import Config, ConfigError
-from jaxswarm.files import RETURN, Row, replace_text
+from jaxswarm.files import Row
 from jaxswarm.host.run import Run
 
 RANGE = re.compile(r"(?P<low>[^,]+?)\.\.(?P<high>[^,:]+):(?P<count>\d+) ?(?P<log>log)?$")
@@ -64,28 +64,37 @@ def programs(sweep: Sequence[Run]) -> list[list[Run]]:
     return list(grouped.values())
 
 
-def summary(sweep: Sequence[Run], rows: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
-    """Return a table of the final return of each run: median and quartiles over the seeds that reached the end.
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """Final values of the runs of a sweep: a line per run, and a line per pair of runs."""
 
-    Runs are sorted by the number of seeds that diverged, lowest first, and then by the median, highest first.
+    comparison: Comparison
+    lines: list[summaries.Line]
+    improvements: list[summaries.Line]
+
+
+def summary(sweep: Sequence[Run], rows: Sequence[Sequence[Row]]) -> Summary:
+    """Return statistics of the final return of each run over the seeds that reached the end.
+
+    If a setting differs on which the scale of the return depends, they are those of a metric that does not depend on
+    it. Runs are sorted by the number of seeds that diverged, lowest first, and then by the median, best first.
     """
-    table = []
+    comparison = compare([run.config["task"] for run in sweep if run.config])
+    column, lines, finals = f"eval/{comparison.metric}", [], {}
     for run, of_run in zip(sweep, rows, strict=True):
-        final = [row[RETURN] for row in of_run if row["update"] == run.num_updates]
-        low, median, high = np.percentile(final, [25, 50, 75]) if final else [np.nan] * 3
-        numbers = {"median": float(median), "q25": float(low), "q75": float(high)}
-        counts = {"seeds": len(final), "diverged": run.settings.num_seeds - len(final)}
-        table.append({"run": run.folder.name} | numbers | counts)
-    return sorted(table, key=lambda line: (line["diverged"], -np.nan_to_num(line["median"], nan=-np.inf)))
+        at_end = [row for row in of_run if row["update"] == run.num_updates]
+        values = np.array([row.get(column, np.nan) for row in at_end], float)
+        finals[run.folder.name] = values[np.isfinite(values)]
+        counts = {"seeds": len(at_end), "diverged": run.settings.num_seeds - len(at_end)}
+        lines.append({"run": run.folder.name, "metric": column} | summaries.summarize(finals[run.folder.name]) | counts)
 
+    def place(line: summaries.Line) -> tuple[int, float]:
+        return line["diverged"], -np.nan_to_num(comparison.better(line["median"]), nan=-np.inf)
 
-def write_summary(path: Path, table: Sequence[dict[str, Any]]) -> None:
-    """Write the table of `summary` as CSV."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(table[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    replace_text(path, buffer.getvalue())
+    lines.sort(key=place)
+    ordered = {line["run"]: finals[line["run"]] for line in lines}
+    lines = [line | summaries.versus_first(ordered, line["run"], comparison.is_higher_better) for line in lines]
+    return Summary(comparison, lines, summaries.pairs(ordered, comparison.is_higher_better))
 
 
 def _listed(word: str) -> str:

@@ -16,7 +16,7 @@ from jaxswarm.physics.geometry import norm
 from jaxswarm.scene import Goals, Scene
 from jaxswarm.tasks.arena import Arena, State, View
 from jaxswarm.tasks.swarm import NumberRange
-from jaxswarm.types import Entities, Key, Metrics, Observation, Step, pytree, static
+from jaxswarm.types import Comparable, Entities, Key, Metrics, Observation, Step, pytree, static
 
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # corner of each cluster, in units of the side
 
@@ -69,6 +69,9 @@ class Assembly:
     active_boxes: NumberRange | None = static(default=None)
 
     action_dim: ClassVar[int] = 2
+    comparable_metrics: ClassVar[tuple[Comparable, ...]] = (
+        Comparable("final_box_distance", ("num_boxes", "active_boxes", "side")),
+    )
 
     def __post_init__(self) -> None:
         _check_fields(self)
@@ -154,6 +157,9 @@ class Clustering:
     active_boxes: NumberRange | None = static(default=None)
 
     action_dim: ClassVar[int] = 2
+    comparable_metrics: ClassVar[tuple[Comparable, ...]] = (
+        Comparable("final_cluster_spread", ("reward", "num_boxes", "active_boxes", "num_clusters", "side")),
+    )
 
     def __post_init__(self) -> None:
         _check_fields(self)

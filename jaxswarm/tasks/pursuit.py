@@ -17,7 +17,7 @@ from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.evasion import evader_direction
 from jaxswarm.tasks.swarm import NumberRange
-from jaxswarm.types import Entities, Key, Metrics, Observation, Step, pytree, static
+from jaxswarm.types import Comparable, Entities, Key, Metrics, Observation, Step, pytree, static
 
 EVADER_STRIDE = 2.0  # world units per step, twice the stride of a pursuer
 CATCH_DISTANCE = {"distance": 1.0, "catches": 2.0}  # world units
@@ -99,6 +99,10 @@ class Pursuit:
     episode_length: int = static(default=1024)
 
     action_dim: ClassVar[int] = 2
+    comparable_metrics: ClassVar[tuple[Comparable, ...]] = (
+        Comparable("catches", ("evader_visibility_radius",), is_higher_better=True),
+        Comparable("evader_distance", ("evader_visibility_radius", "episode_length", "reward")),
+    )
 
     def __post_init__(self) -> None:
         swarm.require_swarm(self, least=1)

@@ -15,7 +15,7 @@ from jaxswarm.physics.neighbors import Neighborhood, neighborhood
 from jaxswarm.scene import Bodies, Scene
 from jaxswarm.tasks import swarm
 from jaxswarm.tasks.swarm import NumberRange, View
-from jaxswarm.types import Entities, Key, Observation, Step, pytree, static
+from jaxswarm.types import Comparable, Entities, Key, Observation, Step, pytree, static
 
 RELATIVE_VELOCITY = {
     "normalized": lambda difference, max_speed: difference / (2 * max_speed),  # in [-1, 1]
@@ -80,6 +80,9 @@ class Rendezvous:
     episode_length: int = static(default=1024)
 
     action_dim: ClassVar[int] = 2
+    comparable_metrics: ClassVar[tuple[Comparable, ...]] = (
+        Comparable("final_center_distance", ("visibility_radius", "episode_length", "side")),
+    )
 
     def __post_init__(self) -> None:
         swarm.require_swarm(self, least=2)
@@ -117,6 +120,8 @@ class Rendezvous:
             reward = -mean_{i<j} min(d_ij, R) / R - 0.001 mean(action^2),  R = visibility_radius
 
         Distances d_ij are those after the move. The move clips actions to [-1, 1], the reward uses unclipped actions.
+        The reward and the metric `distance` depend on R. The metric `final_center_distance` does not; see
+        `swarm.center_distance`.
         """
         state = self.motion.move(self.space, state, action).replace(time=state.time + 1)
         is_present = swarm.is_present(state.active_agents, self.num_agents)
@@ -130,7 +135,13 @@ class Rendezvous:
             reward=-distance / self.visibility_radius - 0.001 * effort,
             terminated=jnp.array(False),
             truncated=is_over,
-            metrics={"distance": distance, "final_distance": jnp.where(is_over, distance, jnp.nan)}
+            metrics={
+                "distance": distance,
+                "final_distance": jnp.where(is_over, distance, jnp.nan),
+                "final_center_distance": jnp.where(
+                    is_over, swarm.center_distance(self.space, state.position, is_present), jnp.nan
+                ),
+            }
             | swarm.overflow(around, is_present, self.max_neighbors),
         )
         return state, step

@@ -1,5 +1,6 @@
 """Functions shared by the tasks of point agents: active agents, start positions, and perceived neighbors."""
 
+import math
 from typing import Any
 
 import jax
@@ -60,6 +61,23 @@ def draw_positions(key: Key, side: float | Float[Array, ""], num_points: int) ->
 def is_present(active: Int[Array, ""], num_slots: int) -> Bool[Array, " slots"]:
     """Mark the first `active` of `num_slots` slots."""
     return jnp.arange(num_slots) < active
+
+
+def center_distance(space: Space, position: Float[Array, "agents 2"], present: Bool[Array, " agents"]) -> Array:
+    """Return the mean distance of the present agents to their center, in world units.
+
+    The center is the mean position. On a torus it is the circular mean of each coordinate.
+    """
+
+    def mean(values: Array) -> Array:
+        return jnp.where(present[:, None], values, 0.0).sum(0) / present.sum()
+
+    center = mean(position)
+    if isinstance(space, Torus):
+        angle = position * (2 * math.pi / space.side)
+        center = jnp.arctan2(mean(jnp.sin(angle)), mean(jnp.cos(angle))) * (space.side / (2 * math.pi))
+    distance = norm(space.displacement(center[None], position))
+    return jnp.where(present, distance, 0.0).sum() / present.sum()
 
 
 def overflow(neighborhood: Neighborhood, present: Bool[Array, " agents"], max_neighbors: int | None) -> Metrics:
