@@ -11,7 +11,8 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 LEVELS = [
-    {"types", "checks", "plot_settings", "scene", "files", "config.schema", "config.renamed"},
+    {"limits", "types", "plot_settings", "scene", "files", "config.renamed"},
+    {"checks", "config.schema"},
     {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "export.program"},
     {"config.plugins", "config.settings", "config.overrides"},
     {"physics.dynamics", "physics.neighbors", "physics.collisions", "aggregators.monoids", "aggregators.attentive"},

@@ -46,7 +46,8 @@ def load(path: Path) -> Config:
     """
     config = read_yaml(path)
     imports = config.get("imports")
-    plugins.run(plugins.locate(imports, path.parent) if isinstance(imports, list) else imports or [])
+    is_list = isinstance(imports, list) and all(isinstance(one, str) for one in imports)
+    plugins.run(plugins.locate(imports, path.parent) if is_list else imports or [])
     return validate(_translate(config, path))
 
 
