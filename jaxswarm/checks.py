@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxswarm.limits import MAX_INTEGER
+from jaxswarm.limits import MAX_ENTITIES, MAX_INTEGER
 
 
 class Check(NamedTuple):
@@ -44,15 +44,19 @@ def _holds(check: Check, value: Any) -> bool:
 
 def integer(least: int, most: int | None = None) -> Check:
     """Accept integers from `least` to `most` (`None`: `MAX_INTEGER`), both included; booleans are rejected."""
-    limit = MAX_INTEGER if most is None else most
+    if most is None:
+        return size(least, MAX_INTEGER)
+    return Check(f"an integer from {least} to {most}", size(least, most).accepts)
+
+
+def size(least: int, most: int = MAX_ENTITIES) -> Check:
+    """Accept integers from `least` to a number `most` beyond any reasonable size."""
 
     def accepts(value: Any) -> bool:
         is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        return is_integer and bool(least <= value <= limit)
+        return is_integer and bool(least <= value <= most)
 
-    if most is None:
-        return Check(f"an integer >= {least}", accepts, MAX_INTEGER)
-    return Check(f"an integer from {least} to {most}", accepts)
+    return Check(f"an integer >= {least}", accepts, most)
 
 
 def choice(names: Iterable[Any]) -> Check:

@@ -29,7 +29,7 @@ LEVELS = [
     {"config.keys"},
     {"config.composition", "config.conversion"},
     {"config", "host.checkpoint", "host.progress", "host.manifest", "host.ensemble"},
-    {"analysis.curves", "render.film", "host.loggers"},
+    {"analysis.curves", "render.film", "host.loggers", "host.estimate"},
     {"analysis.plots", "render.page", "render.pictures"},
     {"analysis.training_curve", "analysis.run_folders", "render"},
     {"analysis"},

@@ -27,8 +27,8 @@ class Attentive(Aggregator):
     orthogonally with gain sqrt(2). The vector of an empty group is 0.
 
     Attributes:
-        num_heads: The attention has this many heads, an integer from 1 to 64 that divides the last layer width before
-            the aggregation.
+        num_heads: The attention has this many heads, an integer >= 1 that divides the last layer width before the
+            aggregation.
         residual: The output of the attention is added to the messages if true, and replaces them if false.
         pooling: The group becomes one vector by a mean with equal weights (`mean`), or by a mean whose weights depend
             on the agent's own state (`query`).
@@ -44,7 +44,7 @@ class Attentive(Aggregator):
     num_encoders: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1, MAX_HEADS), "num_heads")
+        require(self, checks.size(1, MAX_HEADS), "num_heads")
         require(self, checks.choice(("mean", "query")), "pooling")
         require(self, checks.BOOL, "residual")
         super().__post_init__()

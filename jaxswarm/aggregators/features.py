@@ -15,7 +15,7 @@ from jaxswarm.aggregators.monoids import Mean
 from jaxswarm.aggregators.sets import Aggregator, DenseView
 from jaxswarm.checks import require
 
-MAX_SIZE = 10_000  # of the axes of bins, centers and slots, which are partly built on the host
+MAX_SIZE = 10_000  # of bins, centers and slots, which are partly computed when the aggregator is traced
 
 
 class Concat(Aggregator):
@@ -25,7 +25,7 @@ class Concat(Aggregator):
     the later features break ties.
 
     Attributes:
-        max_entities: The vector holds the features of at most this many entities (an integer from 1 to 10000), and entities
+        max_entities: The vector holds the features of at most this many entities (an integer >= 1), and entities
             farther away are ignored.
     """
 
@@ -35,7 +35,7 @@ class Concat(Aggregator):
     num_encoders: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1, MAX_SIZE), "max_entities")
+        require(self, checks.size(1, MAX_SIZE), "max_entities")
         super().__post_init__()
 
     def pool(self, view: DenseView) -> Float[Array, "receivers all_features"]:
@@ -62,8 +62,8 @@ class Histogram(Aggregator):
     empty group is 0.
 
     Attributes:
-        num_distances: The distances from 0 to `max_distance` are divided into this many equal bins (an integer from 1 to 10000).
-        num_bearings: The circle of bearings is divided into this many equal bins (an integer from 3 to 10000).
+        num_distances: The distances from 0 to `max_distance` are divided into this many equal bins (an integer >= 1).
+        num_bearings: The circle of bearings is divided into this many equal bins (an integer >= 3).
         max_distance: The last bin of distance ends at this value (> 0, in the unit of the feature) and also counts all
             entities beyond it.
     """
@@ -77,8 +77,8 @@ class Histogram(Aggregator):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1, MAX_SIZE), "num_distances")
-        require(self, checks.integer(3, MAX_SIZE), "num_bearings")
+        require(self, checks.size(1, MAX_SIZE), "num_distances")
+        require(self, checks.size(3, MAX_SIZE), "num_bearings")
         require(self, checks.POSITIVE, "max_distance")
         super().__post_init__()
 
@@ -108,8 +108,8 @@ class RadialBasis(Aggregator):
     second factor is a Gaussian of width v. The vector of an empty group is 0.
 
     Attributes:
-        num_distances: This many centers (an integer from 2 to 10000) are evenly spaced from distance 0 to `max_distance`.
-        num_bearings: This many centers (an integer from 2 to 10000) are evenly spaced on the circle of bearings.
+        num_distances: This many centers (an integer >= 2) are evenly spaced from distance 0 to `max_distance`.
+        num_bearings: This many centers (an integer >= 2) are evenly spaced on the circle of bearings.
         max_distance: The last center of distance lies at this value (> 0, in the unit of the feature).
         distance_width: The functions of distance have this standard deviation (> 0, in spacings between the centers).
         bearing_width: The functions of bearing have this standard deviation near their centers (> 0, in spacings
@@ -127,7 +127,7 @@ class RadialBasis(Aggregator):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(2, MAX_SIZE), "num_distances", "num_bearings")
+        require(self, checks.size(2, MAX_SIZE), "num_distances", "num_bearings")
         require(self, checks.POSITIVE, "max_distance", "distance_width", "bearing_width")
         super().__post_init__()
 

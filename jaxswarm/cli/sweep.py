@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
-from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
+from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help, warn
 from jaxswarm.config import ConfigError, renamed
 from jaxswarm.files import claim_folder, is_vacant, read_text, removed_if_empty
 
@@ -74,15 +74,18 @@ def _run(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> 
 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals  # noqa: PLC0415
     from jaxswarm.studies import grid  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
 
     runs = grid.runs(grid.expand(overrides), sweep_dir)
     programs = grid.programs(runs)
-    _save(sweep_dir, {}, overrides)
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
+    for first, *others in programs:
+        num_runs = (1 + len(others)) * first.settings.num_seeds
+        estimate.check_training(first.experiment, num_runs, first.num_updates, warn)
+    _save(sweep_dir, {}, overrides)
     print(f"{_count(runs, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
     for number, together in enumerate(programs):
@@ -104,7 +107,7 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
 
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
     from jaxswarm.studies import search  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
@@ -113,9 +116,10 @@ def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) 
     config = configs.compose_pairs(pairs)
     space = search.load_space(options["search"], config)
     num_trials = parse_integer("trials", options.get("trials", 20), 1)
-    _save(sweep_dir, options, overrides)
     use_compile_cache()
     ensemble.use_cores(config["num_seeds"])
+    estimate.check_training(configs.build(config), configs.run_settings(config).num_seeds)
+    _save(sweep_dir, options, overrides)
     study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")))
     search.requeue_killed(study, sweep_dir)
     while search.num_started(study) < num_trials:

@@ -21,6 +21,7 @@ from jaxswarm.cli.program import (
     split,
     use_compile_cache,
     wants_help,
+    warn,
 )
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.files import claim_folder, is_vacant, removed_if_empty
@@ -95,13 +96,14 @@ def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool) -> int:
 
 def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool) -> int:
     use_compile_cache()
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals  # noqa: PLC0415
     from jaxswarm.host.checkpoint import CheckpointError  # noqa: PLC0415
     from jaxswarm.host.fit import DivergedError, fit_runs  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
 
     run = Run.from_config(config, run_dir)
     ensemble.use_cores(run.settings.num_seeds)
+    estimate.check_training(run.experiment, run.settings.num_seeds, run.num_updates, warn)
     print(_summary(config, run), flush=True)
     try:
         train_state, (rows,) = fit_runs([run], resume=is_resumed)

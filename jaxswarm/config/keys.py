@@ -167,7 +167,7 @@ def _unknown_key(key: str, prefix: str, config: Config) -> ConfigError:
 
 
 def _owners(name: str, prefix: str) -> dict[str, list[str]]:
-    """Return the choices whose class has a field of this name, by part; only of the part `prefix` unless it is empty."""
+    """Return the choices whose class has a field of this name, by part; with a `prefix`, only of this part."""
     owners = {}
     for part in [prefix] if prefix in REGISTERED else REGISTERED:
         has_name = {own for own, cls in registries()[part].items() if name in schema.parameters(cls)}

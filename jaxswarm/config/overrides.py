@@ -8,7 +8,7 @@ from typing import Any
 from jaxswarm.config.schema import ConfigError, shown
 
 PATHS = ("init_from", "imports")  # keys whose values are paths
-MAX_COMBINATIONS = 10_000  # of the values of a sweep
+MAX_COMBINATIONS = 1000  # of the values of a sweep
 
 
 def parse(overrides: Sequence[str]) -> list[tuple[str, Any]]:

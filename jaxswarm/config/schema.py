@@ -96,6 +96,9 @@ def _spelling(value: Any, annotation: Any) -> str:
     """Return the right spelling of a value that is close to valid, to append to a message."""
     if isinstance(value, float) and value.is_integer() and abs(value) <= MAX_INTEGER:
         return f" (write {int(value)})"
+    is_tuple = [typing.get_origin(accepted) is tuple for accepted in _members(annotation)]
+    if isinstance(value, list) and not any(is_tuple) and value and all(map(is_number, value)):
+        return " (the values of a sweep have no brackets)"
     for accepted in _members(annotation):
         if typing.get_origin(accepted) is tuple and not isinstance(value, list | tuple | dict):
             element = typing.get_args(accepted)[0]

@@ -23,7 +23,7 @@ from jaxswarm import config as configs
 from jaxswarm import files, render
 from jaxswarm.config import ConfigError, RunSettings
 from jaxswarm.files import Row
-from jaxswarm.host import ensemble, loggers, trained
+from jaxswarm.host import ensemble, estimate, loggers, trained
 from jaxswarm.host.batch_recorder import BatchRecorder, Chunk, DivergedError
 from jaxswarm.host.checkpoint import Restored, restore, set_aside_after
 from jaxswarm.host.ensemble import RunBatch, abstract_state
@@ -107,6 +107,7 @@ def fit_runs(runs: Sequence[Run], *, resume: bool = False, progress: bool = True
         check_folder(run, resume)
         for name in run.settings.loggers:
             loggers.import_package(name)
+    estimate.check_training(runs[0].experiment, sum(len(run.seeds) for run in runs))
     runs = [_prepared(run) for run in runs]
     started, new = split_started([run.run_dir for run in runs if run.run_dir])
     if started and new:
@@ -127,20 +128,11 @@ def _prepared(run: Run) -> Run:
     if params is None and run.run_dir:
         params = trained.warm_start(run.settings, run.run_dir)
     if params is not None:
-        _check_params(run, params)
+        needed = abstract_state(run.experiment).learner.params
+        trained.check_params(params, jax.tree.map(lambda x: x.shape[1:], needed), run.settings.init_from)
     if on_evaluation is None and run.run_dir and run.settings.render_every:
         on_evaluation = render.hook(run.run_dir, run.experiment, run.settings.render_every)
     return dataclasses.replace(run, init_params=params, on_evaluation=on_evaluation)
-
-
-def _check_params(run: Run, params: Any) -> None:
-    """Raise a `ConfigError` for parameters that do not fit the run's network."""
-    needed = abstract_state(run.experiment).learner.params
-    if jax.tree.map(np.shape, params) != jax.tree.map(lambda x: x.shape[1:], needed):
-        raise ConfigError(
-            "init_params: must have the parameter shapes of this network; "
-            "train the warm start with the same network, observation features and actions"
-        )
 
 
 def _fit(runs: Sequence[Run], resume: bool, progress: bool) -> tuple[TrainState, list[list[Row]]]:

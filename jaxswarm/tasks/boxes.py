@@ -18,7 +18,7 @@ from jaxswarm.tasks.arena import Arena, State, View
 from jaxswarm.tasks.swarm import NumberRange
 from jaxswarm.types import Entities, Key, Metrics, Observation, Step, pytree, static
 
-MAX_BOXES = 1000  # the physics of all pairs of boxes is built at tracing
+MAX_BODIES = 1000  # robots or boxes; tables of all pairs are built when the physics is traced
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # corner of each cluster, in units of the side
 
 
@@ -38,8 +38,8 @@ def _with_final_values(is_over: Bool[Array, ""], metrics: Metrics) -> Metrics:
 
 
 def _check_fields(task: "Assembly | Clustering") -> None:
-    require(task, checks.integer(1), "num_agents", "episode_length")
-    require(task, checks.integer(1, MAX_BOXES), "num_boxes")
+    require(task, checks.integer(1), "episode_length")
+    require(task, checks.size(1, MAX_BODIES), "num_agents", "num_boxes")
     fits_a_box = checks.Check(
         f"a finite number >= {2 * BOX_SIDE}, so that a box fits", lambda x: 2 * BOX_SIDE <= x < math.inf
     )
@@ -56,7 +56,7 @@ class Assembly:
 
     Attributes:
         num_agents: An environment has this number of robots, an integer >= 1.
-        num_boxes: An environment has this number of boxes, an integer from 1 to 1000.
+        num_boxes: An environment has this number of boxes, an integer >= 1.
         side: The sides of the square arena have this length in meters; boxes have sides of 0.1 m.
         episode_length: An episode is truncated after this number of steps of 1 s, an integer >= 1.
         physics: The physics solver is "faithful" (10 substeps per step) or "fast" (5 substeps per step).
@@ -133,7 +133,7 @@ class Clustering:
 
     Attributes:
         num_agents: An environment has this number of robots, an integer >= 1.
-        num_boxes: An environment has this number of boxes (1 to 1000); the first boxes have the first color, and so on.
+        num_boxes: An environment has this number of boxes; the first boxes have the first color, and so on.
         side: The sides of the square arena have this length in meters; boxes have sides of 0.1 m.
         episode_length: An episode is truncated after this number of steps of 1 s, an integer >= 1.
         num_clusters: The boxes have this number of colors, at most 4 with the reward "corners".
