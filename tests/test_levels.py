@@ -13,6 +13,7 @@ PACKAGE = Path(jaxswarm.__file__).parent
 LEVELS = [
     {"limits", "types", "plot_settings", "scene", "files", "config.renamed"},
     {"checks", "config.schema"},
+    {"registry"},
     {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "export.program"},
     {"config.plugins", "config.settings", "config.overrides"},
     {"physics.dynamics", "physics.neighbors", "physics.collisions", "aggregators.monoids", "aggregators.attentive"},

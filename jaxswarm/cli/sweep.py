@@ -158,8 +158,12 @@ def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) ->
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
     try:
         plan = json.loads(read_text(sweep_dir / PLAN))
-        if "words" in plan:  # version 0.1
-            return dict(plan["options"]), [renamed.translate_override(text) for text in plan["words"]]
-        return dict(plan["options"]), [str(text) for text in plan["overrides"]]
+        options, is_old = dict(plan["options"]), "words" in plan  # version 0.1
+        overrides = list(plan["words" if is_old else "overrides"])
+        if not all(isinstance(text, str) for text in (*options, *options.values(), *overrides)):
+            raise ValueError("options and overrides must be texts")
+        if unknown := set(options) - set(OPTIONS):
+            raise ValueError(f"unknown option {unknown.pop()!r}")
+        return options, [renamed.translate_override(text) for text in overrides] if is_old else overrides
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no valid {PLAN}") from error
+        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no valid {PLAN} ({error})") from error

@@ -26,7 +26,7 @@ def build(config: Config) -> "Experiment":
     try:
         task, aggregator = build_part("task", config), build_part("aggregator", config)
         fields = _with_tuples(config["network"])
-        with _prefixed("network"):
+        with _prefixed("network", "aggregator", fields=config["aggregator"]):
             network = ActorCritic(**fields, aggregator=aggregator, action_dim=task.action_dim)
         sizes = {name: config[name] for name in experiment_fields()}
         experiment = Experiment(task, network, build_part("learner", config), **sizes)
@@ -47,12 +47,16 @@ def build_part(part: str, config: Config) -> Any:
 
 
 @contextlib.contextmanager
-def _prefixed(part: str) -> Iterator[None]:
-    """Turn errors of a constructor into a `ConfigError` that names the key with the part as its prefix."""
+def _prefixed(part: str, other: str = "", fields: Iterable[str] = ()) -> Iterator[None]:
+    """Turn errors of a constructor into a `ConfigError` that names the key with the part as its prefix.
+
+    Keys in `fields` get the prefix `other` instead.
+    """
     try:
         yield
     except (TypeError, ValueError) as error:
-        is_field = re.match(r"\w+: must ", str(error))
+        is_field = re.match(r"(\w+): must ", str(error))
+        part = other if is_field and is_field[1] in fields else part
         raise ConfigError(f"{part}{'.' if is_field else ': '}{' '.join(str(error).split())}") from error
 
 

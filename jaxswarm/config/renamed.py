@@ -84,6 +84,22 @@ def translate_override(text: str) -> str:
     return f"{key}{equals}{','.join(values)}"
 
 
+def translate_space(space: dict[str, Any], is_key: Callable[[str], bool]) -> tuple[dict[str, Any], list[str]]:
+    """Return the search space with present names, and one text "old -> new" for each name of version 0.1 in it.
+
+    `is_key(key)` says whether a key of version 0.1 is a key of the searched config, so that it must not be translated.
+    """
+    result, changes = {}, []
+    for old, choice in space.items():
+        key = old if is_key(old) else current_key(old) or old
+        full = KEYS.get(old, key)
+        values = [current_value(full, x) or x for x in choice] if isinstance(choice, list) else choice
+        if (key, values) != (old, choice):
+            changes.append(f"{old} -> {key}" if key != old else f"values of {key}")
+        result[key] = values
+    return result, changes
+
+
 def translate(config: dict[str, Any], has_field: Callable[[str, str], bool]) -> tuple[dict[str, Any], list[str]]:
     """Return the config with present names, and one text "old -> new" for each name of version 0.1 in it.
 

@@ -31,7 +31,7 @@ from jaxswarm.host.progress import Progress
 from jaxswarm.host.recorder import Recorder, plot_curve
 from jaxswarm.host.run import Run, check_folder, locked, split_started
 from jaxswarm.host.signals import stop_requests
-from jaxswarm.training import Experiment, TrainState
+from jaxswarm.training import Experiment, TrainState, init
 
 __all__ = ["DivergedError", "fit", "fit_runs"]
 
@@ -128,8 +128,8 @@ def _prepared(run: Run) -> Run:
     if params is None and run.run_dir:
         params = trained.warm_start(run.settings, run.run_dir)
     if params is not None:
-        needed = abstract_state(run.experiment).learner.params
-        trained.check_params(params, jax.tree.map(lambda x: x.shape[1:], needed), run.settings.init_from)
+        needed = jax.eval_shape(init, run.experiment, jax.random.key(0)).learner.params
+        trained.check_params(params, needed, run.settings.init_from)
     if on_evaluation is None and run.run_dir and run.settings.render_every:
         on_evaluation = render.hook(run.run_dir, run.experiment, run.settings.render_every)
     return dataclasses.replace(run, init_params=params, on_evaluation=on_evaluation)

@@ -63,11 +63,7 @@ def check_params(params: Any, needed: Any, init_from: str | None) -> None:
 
     `init_from` is the run folder that the parameters are from; `None`: they are the argument `init_params` of `fit`.
     """
-    given = {jax.tree_util.keystr(path): np.shape(x) for path, x in jax.tree.leaves_with_path(params)}
-    is_shape = lambda x: isinstance(x, tuple) and all(isinstance(n, int) for n in x)  # noqa: E731
-    wanted = {
-        jax.tree_util.keystr(path): x for path, x in jax.tree.leaves_with_path(needed, is_leaf=is_shape)
-    }
+    given, wanted = _shapes_by_name(params), _shapes_by_name(needed)
     names = [name for name in {**wanted, **given} if given.get(name) != wanted.get(name)]
     if not names:
         return
@@ -78,6 +74,11 @@ def check_params(params: Any, needed: Any, init_from: str | None) -> None:
         f"{source}: must have the parameter shapes of this network, but {'; '.join(shown[:MAX_NAMED])}{more}; "
         "train the warm start with the same network, observation features and actions"
     )
+
+
+def _shapes_by_name(params: Any) -> dict[str, tuple[int, ...]]:
+    leaves = jax.tree.leaves_with_path(params)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): np.shape(x) for path, x in leaves}
 
 
 def load_policies(
