@@ -74,7 +74,7 @@ def _run(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> 
 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble, estimate, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
     from jaxswarm.studies import grid  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
 
@@ -85,6 +85,7 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
     for first, *others in programs:
         num_runs = (1 + len(others)) * first.settings.num_seeds
         estimate.check_training(first.experiment, num_runs, first.num_updates, warn)
+        trained.require_warm_start(first.settings)
     _save(sweep_dir, {}, overrides)
     print(f"{_count(runs, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
@@ -107,7 +108,7 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
 
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble, estimate, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
     from jaxswarm.studies import search  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
@@ -118,9 +119,12 @@ def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) 
     num_trials = parse_integer("trials", options.get("trials", 20), 1)
     use_compile_cache()
     ensemble.use_cores(config["num_seeds"])
-    estimate.check_training(configs.build(config), configs.run_settings(config).num_seeds)
+    run_settings = configs.run_settings(config)
+    estimate.check_training(configs.build(config), run_settings.num_seeds)
+    trained.require_warm_start(run_settings)
+    study = search.open_study(options["storage"]) if "storage" in options else None
     _save(sweep_dir, options, overrides)
-    study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")))
+    study = search.open_study(str(sweep_dir / "journal.log")) if study is None else study
     search.requeue_killed(study, sweep_dir)
     while search.num_started(study) < num_trials:
         asked = search.ask(study, config["seed"])
@@ -158,6 +162,8 @@ def _save(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) ->
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
     try:
         plan = json.loads(read_text(sweep_dir / PLAN))
+        if not isinstance(plan, dict):
+            raise ValueError("it must be a mapping")
         options, is_old = dict(plan["options"]), "words" in plan  # version 0.1
         overrides = list(plan["words" if is_old else "overrides"])
         if not all(isinstance(text, str) for text in (*options, *options.values(), *overrides)):

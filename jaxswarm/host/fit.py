@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxswarm import config as configs
 from jaxswarm import files, render
-from jaxswarm.config import ConfigError, RunSettings
+from jaxswarm.config import RunSettings
 from jaxswarm.files import Row
 from jaxswarm.host import ensemble, estimate, loggers, trained
 from jaxswarm.host.batch_recorder import BatchRecorder, Chunk, DivergedError

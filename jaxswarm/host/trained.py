@@ -53,9 +53,14 @@ def warm_start(settings: RunSettings, run_dir: Path) -> Any:
     """
     if settings.init_from is None or has_checkpoint(run_dir):
         return None
-    if not (Path(settings.init_from) / "config.yaml").is_file():
-        raise ConfigError(f"init_from: must be a run folder, got {settings.init_from!r}")
+    require_warm_start(settings)
     return load(settings.init_from)[1]
+
+
+def require_warm_start(settings: RunSettings) -> None:
+    """Raise a `ConfigError` if `init_from` is set and no run folder."""
+    if settings.init_from is not None and not (Path(settings.init_from) / "config.yaml").is_file():
+        raise ConfigError(f"init_from: must be a run folder, got {settings.init_from!r}")
 
 
 def check_params(params: Any, needed: Any, init_from: str | None) -> None:

@@ -107,7 +107,8 @@ def _listed(word: str) -> str:
         if not is_valid or count > MAX_COMBINATIONS:
             raise ValueError
     except ValueError:
-        accepted = f"low..high:count or 'low..high:count log' with 2 <= count <= {MAX_COMBINATIONS} and, for log, positive numbers"
+        counts = f"2 <= count <= {MAX_COMBINATIONS}"
+        accepted = f"low..high:count or 'low..high:count log' with {counts} and, for log, positive numbers"
         raise ConfigError(f"{key}: must be {accepted}, got {value!r}") from None
     numbers = np.geomspace(low, high, count) if found["log"] else np.linspace(low, high, count)
     is_integer = all(float(x).is_integer() for x in (low, high)) and all(abs(x - round(x)) < 1e-9 for x in numbers)
