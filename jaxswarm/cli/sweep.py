@@ -171,5 +171,5 @@ def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
         if unknown := set(options) - set(OPTIONS):
             raise ValueError(f"unknown option {unknown.pop()!r}")
         return options, [renamed.translate_override(text) for text in overrides] if is_old else overrides
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no valid {PLAN} ({error})") from error

@@ -53,7 +53,7 @@ class RunSettings:
             name, value = field.name, getattr(self, field.name)
             least, most = LEAST.get(name, 1), MOST.get(name, MAX_INTEGER)
             if is_number(value) and not least <= value <= most:
-                raise ConfigError(f"{name}: must be a number from {least} to {most}, got {shown(value)}")
+                raise ConfigError(f"{name}: must be a number from {least} to {most:.16g}, got {shown(value)}")
         if self.seed + self.num_seeds > 2**32:
             raise ConfigError(f"seed: seed + num_seeds must be at most 2**32, got {self.seed} + {self.num_seeds}")
 
