@@ -46,13 +46,18 @@ def experiment(*overrides: str) -> "Experiment":
 
 
 def make(name: str, **fields: Any) -> "Assembly | Clustering | Pursuit | Rendezvous":
-    """Build the task that is registered under this name, `TASKS[name](**fields)`.
+    """Build the task of this name: a registered class, or a preset of `jaxswarm-train task=NAME` with other fields.
 
     The annotation lists the tasks of this package; a task that you register is built as well. Raises a `ValueError`
     for an unknown name and for impossible values of fields.
     """
+    from jaxswarm.config import groups  # noqa: PLC0415
     from jaxswarm.tasks import TASKS  # noqa: PLC0415
 
-    if name not in TASKS:
-        raise ValueError(f"task: must be one of {', '.join(TASKS)}, got {name!r}")
-    return TASKS[name](**fields)
+    if name in TASKS:
+        return TASKS[name](**fields)
+    presets = groups.choices()["task"]
+    if name not in presets:
+        raise groups.unknown_choice("task", name, list(dict.fromkeys([*TASKS, *presets])))
+    fields = groups.preset("task", name) | fields
+    return TASKS[fields.pop("name")](**fields)

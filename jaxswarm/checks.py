@@ -7,12 +7,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxswarm.limits import MAX_ENTITIES, MAX_INTEGER
+
 
 class Check(NamedTuple):
-    """A condition on a value; `description` completes the sentence "must be ..."."""
+    """A condition on a value; `description` completes the sentence "must be ...".
+
+    Values above `most` get a message of their own, because the description does not mention it.
+    """
 
     description: str
     accepts: Callable[[Any], bool]
+    most: float = math.inf
 
 
 def require(owner: Any, check: Check, *names: str) -> None:
@@ -24,7 +30,9 @@ def require(owner: Any, check: Check, *names: str) -> None:
         value = getattr(owner, name)
         is_array = isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.ndim > 0)
         if not is_array and not _holds(check, value):
-            raise ValueError(f"{name}: must be {check.description}, got {value!r}")
+            is_large = isinstance(value, int) and value > check.most
+            accepted = f"an integer of at most {check.most}" if is_large else check.description
+            raise ValueError(f"{name}: must be {accepted}, got {value!r}")
 
 
 def _holds(check: Check, value: Any) -> bool:
@@ -35,13 +43,20 @@ def _holds(check: Check, value: Any) -> bool:
 
 
 def integer(least: int, most: int | None = None) -> Check:
-    """Accept integers from `least` to `most`, both included; booleans are rejected."""
+    """Accept integers from `least` to `most` (`None`: `MAX_INTEGER`), both included; booleans are rejected."""
+    if most is None:
+        return size(least, MAX_INTEGER)
+    return Check(f"an integer from {least} to {most}", size(least, most).accepts)
+
+
+def size(least: int, most: int = MAX_ENTITIES) -> Check:
+    """Accept integers from `least` to a number `most` beyond any reasonable size."""
 
     def accepts(value: Any) -> bool:
         is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        return is_integer and bool(least <= value) and (most is None or bool(value <= most))
+        return is_integer and bool(least <= value <= most)
 
-    return Check(f"an integer >= {least}" if most is None else f"an integer from {least} to {most}", accepts)
+    return Check(f"an integer >= {least}", accepts, most)
 
 
 def choice(names: Iterable[Any]) -> Check:
@@ -52,7 +67,7 @@ def choice(names: Iterable[Any]) -> Check:
 
 def optional(check: Check) -> Check:
     """Accept `None` and all values that `check` accepts."""
-    return Check(f"null or {check.description}", lambda value: value is None or check.accepts(value))
+    return Check(f"null or {check.description}", lambda value: value is None or check.accepts(value), check.most)
 
 
 def integer_range(least: int, most: int) -> Check:

@@ -13,6 +13,7 @@ from jaxswarm.aggregators import Mean, sets
 from jaxswarm.aggregators.sets import EntityEncoder, RestrictsWidth, check_shape
 from jaxswarm.checks import require
 from jaxswarm.distributions import Policy, gaussian
+from jaxswarm.limits import MAX_WIDTH
 from jaxswarm.types import Entities, Observation
 
 
@@ -195,7 +196,8 @@ class ActorCritic(nn.Module):
 
     def __post_init__(self) -> None:
         require(self, checks.Check("an aggregator, like Mean()", lambda x: isinstance(x, nn.Module)), "aggregator")
-        require(self, checks.Check("a tuple of integers >= 1", _are_widths), "encoder", "shared_encoder", "decoder")
+        widths = checks.Check(f"a tuple of integers from 1 to {MAX_WIDTH}", _are_widths)
+        require(self, widths, "encoder", "shared_encoder", "decoder")
         require(self, checks.Check("a list of at least one layer, like [64]", lambda x: len(x) > 0), "encoder")
         require(self, checks.choice(ACTIVATIONS), "activation")
         require(self, checks.choice(("separate", "shared")), "latent_space")
@@ -247,7 +249,7 @@ class ActorCritic(nn.Module):
 
 
 def _are_widths(value: Any) -> bool:
-    return isinstance(value, tuple) and all(map(checks.integer(1).accepts, value))
+    return isinstance(value, tuple) and all(map(checks.size(1, MAX_WIDTH).accepts, value))
 
 
 def map_log_std(function: Callable[[Array], Array], params: dict[str, Any]) -> dict[str, Any]:

@@ -104,12 +104,21 @@ class TrainState:
 
 @jax.jit
 def init(experiment: Experiment, key: Key) -> TrainState:
-    """Return the state before the first update."""
+    """Return the state before the first update; raises a `TypeError` if `key` is no PRNG key."""
+    _require_key(key)
     run_key, params_key, obs_key, envs_key = jax.random.split(key, 4)
     obs = experiment.task.observe(experiment.task.reset(obs_key))
     params = experiment.network.init(params_key, obs)
     envs = rollout.start(envs_key, experiment.task, experiment.num_envs, experiment.desynchronized_start)
     return TrainState(jnp.zeros((), jnp.int32), run_key, experiment.learner.init(params), envs, jnp.array(True))
+
+
+def _require_key(key: Any) -> None:
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", ())
+    is_raw = dtype == jnp.uint32 and len(shape) == 1
+    if dtype is None or not (jnp.issubdtype(dtype, jax.dtypes.prng_key) or is_raw):
+        given = "None" if dtype is None else f"an array of type {dtype} with the shape {shape}"
+        raise TypeError(f"key: must be a PRNG key such as jax.random.key(0), got {given}")
 
 
 @partial(jax.jit, static_argnames="num_updates")

@@ -121,18 +121,23 @@ def test_a_reader_that_goes_away_is_no_mistake():
 
 
 @pytest.mark.parametrize(
-    ("error", "part"),
+    ("error", "code", "part"),
     [
-        (PermissionError(13, "Permission denied", "runs/x"), "runs/x: Permission denied"),
-        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"), "error: out of memory; reduce"),
+        (PermissionError(13, "Permission denied", "runs/x"), 2, "runs/x: Permission denied"),
+        (OSError(28, "No space left on device", "runs/x"), 1, "runs/x: No space left on device"),
+        (
+            RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"),
+            1,
+            "error: out of memory; reduce",
+        ),
     ],
 )
-def test_what_machines_refuse_is_one_line(error, part, capsys):
+def test_what_machines_refuse_is_one_line(error, code, part, capsys):
     @commands.program
     def main(arguments):
         raise error
 
-    assert main([]) == 1
+    assert main([]) == code
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1
@@ -193,7 +198,7 @@ def test_a_larger_swarm_begins_with_the_policy_of_a_smaller_one(finished, tmp_pa
     assert train.main([*TINY, "init_from=nowhere", "run_dir=other"]) == 2
     assert "init_from: must be a run folder, got" in capsys.readouterr().err
     assert train.main([*TINY, "network.encoder=[5]", f"init_from={finished}", "run_dir=other"]) == 2
-    assert "init_params: must have the parameter shapes" in capsys.readouterr().err
+    assert f"init_from={finished}: must have the parameter shapes" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
 
 

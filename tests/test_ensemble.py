@@ -85,7 +85,7 @@ def test_side_by_side_by_vmap_is_the_same_to_rounding(three_seeds, monkeypatch):
 @pytest.mark.slow
 def test_a_program_that_would_not_fit_takes_fewer_runs_at_a_time_and_says_if_one_is_too_many(monkeypatch):
     monkeypatch.setattr(ensemble, "CPU_WIDTH", 4)
-    monkeypatch.setattr(ensemble, "_free_memory", lambda: 1e3)
+    monkeypatch.setattr(ensemble, "free_memory", lambda: 1e3)
     batch, said = ensemble.make_batch([EXPERIMENT], 4), []
     states = ensemble.init_batch(batch, range(4))
     ensemble.compile_batch(batch, states, 3, said.append)

@@ -99,6 +99,10 @@ def test_a_policy_is_exported_for_more_agents(run_dir, tmp_path, capsys):
         (["num_envs=3"], "num_envs cannot be changed here"),
         (["task.dynamics=velocity"], "observations of other sizes"),
         (["nowhere"], "give one run folder, got 2"),
+        (["task=pursuit"], "task: must be 'rendezvous', which the policy was trained with, got 'pursuit'"),
+        (["out=policy.onnx"], "out: must end in .jax, got 'policy.onnx'"),
+        (["out=/proc/x.jax"], "out: cannot write to /proc/x.jax"),
+        (["task.num_agents=1000000"], "task.num_agents: must be small enough for the memory, got 1000000"),
     ],
 )
 def test_a_wrong_export_is_one_line(run_dir, tmp_path, capsys, overrides, part):

@@ -11,7 +11,9 @@ import jaxswarm
 
 PACKAGE = Path(jaxswarm.__file__).parent
 LEVELS = [
-    {"types", "checks", "plot_settings", "scene", "files", "config.schema", "config.renamed"},
+    {"limits", "types", "plot_settings", "scene", "files", "config.renamed"},
+    {"checks", "config.schema"},
+    {"registry"},
     {"physics.geometry", "physics.contacts", "aggregators.sets", "distributions", "export.program"},
     {"config.plugins", "config.settings", "config.overrides"},
     {"physics.dynamics", "physics.neighbors", "physics.collisions", "aggregators.monoids", "aggregators.attentive"},
@@ -29,7 +31,7 @@ LEVELS = [
     {"config.composition", "config.conversion"},
     {"config", "host.checkpoint", "host.progress", "host.manifest", "host.ensemble", "host.metrics_log"},
     {"host.identity"},
-    {"analysis.curves", "analysis.comparability", "analysis.legends", "render.film", "host.loggers"},
+    {"analysis.curves", "analysis.comparability", "analysis.legends", "render.film", "host.loggers", "host.estimate"},
     {"analysis.plots", "analysis.summaries", "render.page", "render.pictures"},
     {"analysis.training_curve", "analysis.run_folders", "render"},
     {"analysis"},

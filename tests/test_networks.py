@@ -232,7 +232,7 @@ def test_with_linear_output_layers_only_hidden_layers_bend(widths):
     ("field", "value", "accepted"),
     [
         ("encoder", (), "a list of at least one layer, like [64]"),
-        ("encoder", (8, 0), "a tuple of integers >= 1"),
+        ("encoder", (8, 0), "a tuple of integers from 1 to 65536"),
         ("aggregator", "mean", "an aggregator, like Mean()"),
         ("aggregator", AGGREGATORS["mean"], "an aggregator, like Mean()"),
         ("linear_output_layers", "no", "true or false"),

@@ -269,10 +269,9 @@ def test_many_series_share_no_color_and_marker():
 def write_run(folder, overrides, seeds=(0,), **columns):
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(configs.dump(configs.compose(overrides)))
-    for seed in seeds:
-        for i in range(3):
-            row = {"update": i, "agent_steps": i * 500, "wall_seconds": 1.0 * i, "seed": seed, "eval/return": -9.0 + i}
-            files.append_row(folder / "metrics.csv", row | columns)
+    starts = [{"update": i, "agent_steps": i * 500, "wall_seconds": 1.0 * i} for i in range(3)]
+    rows = [row | {"seed": seed, "eval/return": -9.0 + row["update"]} for seed in seeds for row in starts]
+    files.write_rows(folder / "metrics.csv", [row | columns for row in rows])
 
 
 @pytest.mark.parametrize(

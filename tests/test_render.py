@@ -222,6 +222,18 @@ def test_a_wrong_command_is_one_line(run_dir, capsys, overrides, part):
     assert err.count("\n") == 1
 
 
+def test_replays_are_numbered_and_a_replaced_file_is_reported(run_dir, tmp_path, capsys):
+    folder = shutil.copytree(run_dir, tmp_path / "run")
+    (folder / "replay.html").write_text("of training")
+    assert program.main([str(folder)]) == 0
+    assert f"wrote {folder / 'replay-2.html'}" in capsys.readouterr().out
+    assert program.main([str(folder)]) == 0
+    assert f"wrote {folder / 'replay-3.html'}" in capsys.readouterr().out
+    assert (folder / "replay.html").read_text() == "of training"
+    assert program.main([str(folder), f"out={folder / 'replay.html'}"]) == 0
+    assert f"replaced {folder / 'replay.html'}" in capsys.readouterr().out
+
+
 def test_training_does_not_fail_by_a_replay(run_dir, capsys):
     experiment = configs.build(configs.load(run_dir / "config.yaml"))
     assert render.write_replay(run_dir, experiment, {"params": {}}, update=1, name="broken.html") is None

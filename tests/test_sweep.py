@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ def test_what_fixes_a_shape_has_a_program_of_its_own(tmp_path):
 
 def test_equal_runs_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="differ only in"):
-        sweep.runs(sweep.expand([*OVERRIDES, "seed=1,2"]), tmp_path)
+        sweep.runs(sweep.expand([*OVERRIDES, "task.side=50,50.0"]), tmp_path)
 
 
 @pytest.mark.slow
@@ -279,3 +280,76 @@ def test_wrong_words_are_errors(tmp_path, capsys):
     assert "trials: must be used with search=NAME" in capsys.readouterr().err
     assert program.main([f"resume={tmp_path}"]) == 2
     assert "not the folder of a sweep" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "null", "3", "[]", '{"options": {}}', '{"words": 3}'),
+        '{"options": {}, "overrides": [1, 2]}',
+        '{"options": 1, "overrides": []}',
+        '{"options": {"search": 1}, "overrides": []}',
+        '{"options": {"out": "x"}, "overrides": []}',
+    ],
+)
+def test_a_damaged_plan_is_refused(text, tmp_path, capsys):
+    (tmp_path / "sweep.json").write_text(text)
+    assert program.main([f"resume={tmp_path}"]) == 2
+    err = capsys.readouterr().err
+    assert "is not the folder of a sweep: it has no valid sweep.json" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["seed=1,2"], "seed: must have one value in a sweep, got 1,2; train several seeds with num_seeds=N"),
+        (["num_updates=1..3:3"], "num_updates: must have one value in a sweep, got 1,2,3"),
+        (["num_envs=1..9:1000000"], "with 2 <= count <= 1000"),
+        (["task.side=1..1e400:3"], "task.side: must be low..high:count"),
+        (["num_envs=2,4", "init_from=nowhere"], "init_from: must be a run folder"),
+        (["num_envs=glob(*)"], "override: must be key=value"),
+        (["num_agents=2,100000"], "task.num_agents: must be small enough for the memory, got 100000"),
+        (["search=thesis", "num_agents=100000"], "task.num_agents: must be small enough for the memory, got 100000"),
+    ],
+)
+def test_a_refused_sweep_writes_nothing(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert program.main(words) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_torn_line_of_a_journal_is_named_with_its_repair(tmp_path, monkeypatch):
+    pytest.importorskip("optuna")
+    monkeypatch.setattr(search, "WRITE_SECONDS", 0.0)
+    storage = tmp_path / "a journal.log"
+    search.open_study(str(storage))
+    complete = storage.read_bytes()
+    number = complete.count(b"\n") + 1
+    for torn in (b'{"op_code": 4, "wor', b'{"op_code": 4, "wor{"op_code": 4}\n'):
+        storage.write_bytes(complete + torn)
+        with pytest.raises(ConfigError) as caught:
+            search.open_study(str(storage))
+        message = str(caught.value)
+        assert f"storage: line {number} of {storage} must be complete JSON" in message
+        assert message.endswith(f"sed -i {number}d '{storage}'")
+    subprocess.run(message.partition("with: ")[2], shell=True, check=True)
+    assert storage.read_bytes() == complete
+    search.open_study(str(storage))
+
+
+def test_a_search_space_of_0_1_is_translated(tmp_path, capsys):
+    (tmp_path / "space.yaml").write_text(
+        "parameters: {learner.max_gradient_norm: [0.5], num_worlds: [2, 4], learner.learning_rate: [1]}\n"
+        "aggregator: {mean: {learner.minibatch: [worlds, agents]}}\n"
+    )
+    space = search.load_space(str(tmp_path / "space.yaml"), config.compose())
+    assert space == {
+        "learner.max_grad_norm": [0.5],
+        "num_envs": [2, 4],
+        "learner.learning_rate": [1],
+        "learner.sampling_unit": ["envs", "agents"],
+    }
+    err = capsys.readouterr().err
+    assert "was written for jaxswarm 0.1; its keys were translated: learner.max_gradient_norm ->" in err

@@ -11,21 +11,23 @@ A message has `num_parts` parts of equal length. With `num_encoders=1` one encod
 encoders as parts each computes one part; with `num_encoders=0` the message is the features of an entity, not encoded.
 """
 
-from flax import linen as nn
-
 from jaxswarm.aggregators.attentive import Attentive
 from jaxswarm.aggregators.features import Concat, Histogram, RadialBasis
 from jaxswarm.aggregators.monoids import Bayesian, Max, Mean, Softmax
+from jaxswarm.registry import Registry
 
-AGGREGATORS: dict[str, type[nn.Module]] = {
-    "mean": Mean,
-    "max": Max,
-    "softmax": Softmax,
-    "bayesian": Bayesian,
-    "attentive": Attentive,
-    "concat": Concat,
-    "histogram": Histogram,
-    "rbf": RadialBasis,
-}
+AGGREGATORS = Registry(
+    "aggregator",
+    {
+        "mean": Mean,
+        "max": Max,
+        "softmax": Softmax,
+        "bayesian": Bayesian,
+        "attentive": Attentive,
+        "concat": Concat,
+        "histogram": Histogram,
+        "rbf": RadialBasis,
+    },
+)
 
 __all__ = ["AGGREGATORS", "Attentive", "Bayesian", "Concat", "Histogram", "Max", "Mean", "RadialBasis", "Softmax"]

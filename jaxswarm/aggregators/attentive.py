@@ -13,6 +13,8 @@ from jaxswarm.aggregators import sets
 from jaxswarm.aggregators.sets import Aggregator, DenseView
 from jaxswarm.checks import require
 
+MAX_HEADS = 64  # each head is a part of the program
+
 
 class Attentive(Aggregator):
     """Multi-head self-attention over the group (Vaswani et al., 2017), a residual, then a weighted mean.
@@ -42,7 +44,7 @@ class Attentive(Aggregator):
     num_encoders: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1), "num_heads")
+        require(self, checks.size(1, MAX_HEADS), "num_heads")
         require(self, checks.choice(("mean", "query")), "pooling")
         require(self, checks.BOOL, "residual")
         super().__post_init__()

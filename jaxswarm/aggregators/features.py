@@ -15,6 +15,8 @@ from jaxswarm.aggregators.monoids import Mean
 from jaxswarm.aggregators.sets import Aggregator, DenseView
 from jaxswarm.checks import require
 
+MAX_SIZE = 10_000  # of bins, centers and slots, which are partly computed when the aggregator is traced
+
 
 class Concat(Aggregator):
     """Concatenation of the features of the nearest entities, the nearest first, padded with zeros.
@@ -33,7 +35,7 @@ class Concat(Aggregator):
     num_encoders: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1), "max_entities")
+        require(self, checks.size(1, MAX_SIZE), "max_entities")
         super().__post_init__()
 
     def pool(self, view: DenseView) -> Float[Array, "receivers all_features"]:
@@ -75,8 +77,8 @@ class Histogram(Aggregator):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1), "num_distances")
-        require(self, checks.integer(3), "num_bearings")
+        require(self, checks.size(1, MAX_SIZE), "num_distances")
+        require(self, checks.size(3, MAX_SIZE), "num_bearings")
         require(self, checks.POSITIVE, "max_distance")
         super().__post_init__()
 
@@ -125,7 +127,7 @@ class RadialBasis(Aggregator):
     reduction: ClassVar[str] = "add"
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(2), "num_distances", "num_bearings")
+        require(self, checks.size(2, MAX_SIZE), "num_distances", "num_bearings")
         require(self, checks.POSITIVE, "max_distance", "distance_width", "bearing_width")
         super().__post_init__()
 

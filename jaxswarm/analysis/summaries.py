@@ -134,7 +134,11 @@ def _cells(lines: Sequence[Line]) -> list[list[str]]:
     counts = [name for name in others if name in ("seeds", "diverged")]
     rows = [[label, *HEADS, *counts]]
     for line in lines:
-        cells = [_interval(*[line[name] for name in names], "p_" in names[0]) for names in HEADS.values()]
+        of_heads = ([line[name] for name in names] for names in HEADS.values())
+        cells = [
+            _interval(value, low, high, "p_" in names[0])
+            for (value, low, high), names in zip(of_heads, HEADS.values(), strict=True)
+        ]
         rows.append([str(line[label]), *cells, *[str(line[name]) for name in counts]])
     return rows
 

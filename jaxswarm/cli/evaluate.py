@@ -77,6 +77,10 @@ def _evaluate(
     tasks = [configs.override(config, pairs)["task"] for pairs in changes]
     built = [configs.build_part("task", {"task": task}) for task in tasks]
     use_compile_cache()
+    from jaxswarm.host import estimate  # noqa: PLC0415
+
+    for task in built:
+        estimate.check_episodes(task, request["episodes"])
     policies = restore_policies(run_dir, config, request["which"], request["train_seeds"])
     if policies is None:
         return None

@@ -18,7 +18,7 @@ perceive, and unneeded slots are masked. Use the mean as the action, clipped to 
 
 options
   PATH             Run folder. Required.
-  out=FILE         Path of the file, default: PATH/policy.jax.
+  out=FILE         Path of the file, which ends in .jax, default: PATH/policy.jax.
   checkpoint=NAME  Checkpoint: best or last, default: best. The best one has the highest mean return over the seeds.
   train_seed=N     Seed of the run whose policy is exported. Integer, default: the first seed.
   task.KEY=VALUE   Change a field of the task, which determines the number of slots. The type is that of the field,
@@ -35,6 +35,7 @@ use it with the packages jax and flatbuffers:
   mean, std = policy.call(own, groups)
 own is {own}, groups is {groups}: (features, mask) of each group\
 """
+SUFFIX = ".jax"  # of the file
 OPTIONS = ("out", "checkpoint", "train_seed")
 
 
@@ -50,6 +51,8 @@ def main(arguments: Sequence[str]) -> int:
     pairs = configs.parse(overrides)
     require_task_keys(pairs, load_config(paths[0]), OPTIONS)
     out = Path(options.get("out", paths[0] / "policy.jax"))
+    if out.suffix not in ("", SUFFIX):
+        raise ConfigError(f"out: must end in {SUFFIX}, got {str(out)!r}")
     if out.is_dir():
         raise ConfigError(f"out: must be a file, got the folder {str(out)!r}")
     use_compile_cache()
@@ -62,9 +65,18 @@ def main(arguments: Sequence[str]) -> int:
 
     task, network, params, update = found
     exported = export.export_policy(task, network, params)
+<<<<<<< HEAD
     out.parent.mkdir(parents=True, exist_ok=True)
     files.replace_bytes(out, bytes(exported.serialize()))
     print(f"wrote {out} ({files.size_text(out)}), the policy after update {update}")
+=======
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        files.replace_bytes(out, bytes(exported.serialize()))
+    except OSError as error:
+        raise ConfigError(f"out: cannot write to {out}: {error.strerror}") from error
+    print(f"wrote {out} ({out.stat().st_size / 1e6:.2f} MB), the policy after update {update}")
+>>>>>>> lines
     own, groups = jax.tree.unflatten(exported.in_tree, map(str, exported.in_avals))[0]
     print(USE.format(path=out, own=own, groups=str(groups).replace("'", "")))
     return 0

@@ -1,6 +1,7 @@
 """The program `jaxswarm-figure`."""
 
 import fnmatch
+import itertools
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -135,11 +136,14 @@ def _section(figure: Any, runs: dict, found: Sequence[Any], out: Path, overrides
 def _train(runs: Mapping[str, Sequence[Any]]) -> bool:
     """Train one series after another, resuming from their folders; return whether all are finished."""
     from jaxswarm.figures import figure as figures  # noqa: PLC0415
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
     from jaxswarm.studies import execution  # noqa: PLC0415
 
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[run.settings.num_seeds for of_series in runs.values() for run in of_series]))
+    for run in itertools.chain(*runs.values()):
+        estimate.check_training(run.experiment, run.settings.num_seeds)
+        trained.require_warm_start(run.settings)
     for number, (series, of_series) in enumerate(runs.items()):
         for run in of_series:
             seeds, steps = run.settings.seeds, run.num_updates * run.experiment.agent_steps_per_update

@@ -69,6 +69,9 @@ def policy_on_task(
     """
     config = load_config(run_dir)
     task = configs.build_part("task", configs.override(config, pairs))
+    from jaxswarm.host import estimate  # noqa: PLC0415
+
+    estimate.check_episodes(task)
     trained = which_seeds(options, config)[:1]
     policies = restore_policies(run_dir, config, which_checkpoint(options), trained)
     if policies is None:

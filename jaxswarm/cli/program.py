@@ -1,6 +1,7 @@
 """Shared parts of the command line programs: options and overrides, exit codes, one line for each user error."""
 
 import contextlib
+import errno
 import functools
 import gc
 import importlib.metadata
@@ -14,6 +15,11 @@ from typing import Any
 
 from jaxswarm import config as configs
 from jaxswarm.config import Config, ConfigError, plugins, schema
+
+UNUSABLE_PATH = {
+    *(errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR),
+    *(errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL),
+}
 
 
 def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | None], int]:
@@ -45,7 +51,7 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
         except OSError as error:
             reason = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error
             print(f"error: {reason}", file=sys.stderr)
-            return 1
+            return 2 if error.errno in UNUSABLE_PATH else 1
         except RuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
@@ -126,10 +132,20 @@ def require_keys(
 
 def require_task_keys(pairs: Sequence[tuple[str, Any]], config: Config, options: Sequence[str]) -> None:
     """Raise a `ConfigError` for the first key that is not a key of the task."""
+    for key, value in pairs:
+        if key in configs.REGISTERED:
+            name, task = config[key]["name"], config["task"]["name"]
+            accepted = f"{name!r}, which the policy was trained with"
+            raise ConfigError(f"{key}: must be {accepted}, got {value!r}; change fields of {task} with task.KEY=VALUE")
     keys = [f"{name}=..." for name in options]
     accepted = ", ".join(["task.<field>=value", *keys])
     meant = [*options, *config["task"], *(f"task.{name}" for name in config["task"])]
     require_keys(pairs, lambda key: configs.full_key(key, config).startswith("task."), accepted, meant)
+
+
+def warn(text: str) -> None:
+    """Print a line on stderr."""
+    print(text, file=sys.stderr)
 
 
 def parse_integer(name: str, value: Any, least: int) -> int:

@@ -1,5 +1,6 @@
 """The program `jaxswarm-render`."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ the file determines its format:
 
 options
   PATH...          One or more run folders. Required.
-  out=FILE         Path of the file, default: replay.html in the first PATH.
+  out=FILE         Path of the file, default: replay.html in the first PATH, or replay-2.html, ... if it exists.
   checkpoint=NAME  Checkpoint: best or last, default: best. The best one has the highest mean return over the seeds.
   seed=N           Seed of the episode. Integer >= 0, default: 0.
   train_seed=N     Seed of the run whose policy is shown. Integer, default: the first seed.
@@ -59,7 +60,8 @@ def main(arguments: Sequence[str]) -> int:
     sizes = {name: parse_integer(name, options[name], 1) for name in ("frames", "until") if name in options}
     pairs = configs.parse(overrides)
     require_task_keys(pairs, load_config(paths[0]), OPTIONS)
-    out = Path(options.get("out", paths[0] / "replay.html"))
+    out = Path(options["out"]) if "out" in options else _vacant(paths[0] / "replay.html")
+    is_replaced = out.exists()
     use_compile_cache()
     from jaxswarm import render  # noqa: PLC0415
 
@@ -75,8 +77,18 @@ def main(arguments: Sequence[str]) -> int:
         raise ConfigError(f"out: cannot write to {out}: {error.strerror}") from error
     for film in films:
         print(f"{film.title}: {film.num_frames - 1} steps, return {film.score[-1]:.2f}")
+<<<<<<< HEAD
     print(f"wrote {out} ({size_text(out)})")
+=======
+    print(f"{'replaced' if is_replaced else 'wrote'} {out} ({out.stat().st_size / 1e6:.1f} MB)")
+>>>>>>> lines
     return 0
+
+
+def _vacant(path: Path) -> Path:
+    """Return the path, with a number appended to the name if the file exists."""
+    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+    return next(one for one in itertools.chain([path], numbered) if not one.exists())
 
 
 def _film(

@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
+<<<<<<< HEAD
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
 from jaxswarm.config import ConfigError, plugins, renamed
+=======
+from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help, warn
+from jaxswarm.config import ConfigError, renamed
+>>>>>>> lines
 from jaxswarm.files import claim_folder, is_vacant, read_text, removed_if_empty
 
 if TYPE_CHECKING:
@@ -82,15 +87,19 @@ def _run(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> 
 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
     from jaxswarm.studies import grid  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
 
     runs = grid.runs(grid.expand(overrides), sweep_dir)
     programs = grid.programs(runs)
-    _save(sweep_dir, {}, overrides)
     use_compile_cache()
     ensemble.use_cores(math.gcd(*[len(together) * together[0].settings.num_seeds for together in programs]))
+    for first, *others in programs:
+        num_runs = (1 + len(others)) * first.settings.num_seeds
+        estimate.check_training(first.experiment, num_runs, first.num_updates, warn)
+        trained.require_warm_start(first.settings)
+    _save(sweep_dir, {}, overrides)
     print(f"{_count(runs, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
     for number, together in enumerate(programs):
@@ -118,7 +127,7 @@ def _report(sweep_dir: Path, summary: "Summary") -> None:
 
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
     from jaxswarm.studies import search  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
@@ -127,10 +136,14 @@ def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) 
     config = configs.compose_pairs(pairs)
     space = search.load_space(options["search"], config)
     num_trials = parse_integer("trials", options.get("trials", 20), 1)
-    _save(sweep_dir, options, overrides)
     use_compile_cache()
     ensemble.use_cores(config["num_seeds"])
-    study = search.open_study(options.get("storage", str(sweep_dir / "journal.log")))
+    run_settings = configs.run_settings(config)
+    estimate.check_training(configs.build(config), run_settings.num_seeds)
+    trained.require_warm_start(run_settings)
+    study = search.open_study(options["storage"]) if "storage" in options else None
+    _save(sweep_dir, options, overrides)
+    study = search.open_study(str(sweep_dir / "journal.log")) if study is None else study
     search.requeue_killed(study, sweep_dir)
     while search.num_started(study) < num_trials:
         asked = search.ask(study, config["seed"])
@@ -175,8 +188,14 @@ def _imports(overrides: Sequence[str]) -> list[str]:
 def _load(sweep_dir: Path) -> tuple[dict[str, str], list[str]]:
     try:
         plan = json.loads(read_text(sweep_dir / PLAN))
-        if "words" in plan:  # version 0.1
-            return dict(plan["options"]), [renamed.translate_override(text) for text in plan["words"]]
-        return dict(plan["options"]), [str(text) for text in plan["overrides"]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no valid {PLAN}") from error
+        if not isinstance(plan, dict):
+            raise ValueError("it must be a mapping")
+        options, is_old = dict(plan["options"]), "words" in plan  # version 0.1
+        overrides = list(plan["words" if is_old else "overrides"])
+        if not all(isinstance(text, str) for text in (*options, *options.values(), *overrides)):
+            raise ValueError("options and overrides must be texts")
+        if unknown := set(options) - set(OPTIONS):
+            raise ValueError(f"unknown option {unknown.pop()!r}")
+        return options, [renamed.translate_override(text) for text in overrides] if is_old else overrides
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{sweep_dir} is not the folder of a sweep: it has no valid {PLAN} ({error})") from error

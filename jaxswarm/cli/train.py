@@ -23,6 +23,7 @@ from jaxswarm.cli.program import (
     substitute_imports,
     use_compile_cache,
     wants_help,
+    warn,
 )
 from jaxswarm.config import Config, ConfigError
 from jaxswarm.files import claim_folder, is_vacant, removed_if_empty
@@ -106,13 +107,16 @@ def _resume(run_dir: Path, overrides: Sequence[str], is_first: bool, force: bool
 
 def _fit(config: Config, run_dir: Path, is_resumed: bool, is_first: bool, force: bool = False) -> int:
     use_compile_cache()
-    from jaxswarm.host import ensemble, signals  # noqa: PLC0415
+    from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
     from jaxswarm.host.checkpoint import CheckpointError  # noqa: PLC0415
     from jaxswarm.host.fit import DivergedError, fit_runs  # noqa: PLC0415
     from jaxswarm.host.run import Run  # noqa: PLC0415
 
     run = Run.from_config(config, run_dir)
     ensemble.use_cores(run.settings.num_seeds)
+    estimate.check_training(run.experiment, run.settings.num_seeds, run.num_updates, warn)
+    if not is_resumed:
+        trained.require_warm_start(run.settings)
     print(_summary(config, run), flush=True)
     try:
         train_state, (rows,) = fit_runs([run], resume=is_resumed, force=force)

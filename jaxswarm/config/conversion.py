@@ -1,8 +1,9 @@
 """Conversion of a config to an experiment and its run settings, and of an experiment to its config."""
 
+import contextlib
 import dataclasses
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from jaxswarm.config import plugins
@@ -23,9 +24,10 @@ def build(config: Config) -> "Experiment":
     from jaxswarm.training import Experiment, init  # noqa: PLC0415
 
     try:
-        task = build_part("task", config)
+        task, aggregator = build_part("task", config), build_part("aggregator", config)
         fields = _with_tuples(config["network"])
-        network = ActorCritic(**fields, aggregator=build_part("aggregator", config), action_dim=task.action_dim)
+        with _prefixed("network", "aggregator", fields=config["aggregator"]):
+            network = ActorCritic(**fields, aggregator=aggregator, action_dim=task.action_dim)
         sizes = {name: config[name] for name in experiment_fields()}
         experiment = Experiment(task, network, build_part("learner", config), **sizes)
         if network.latent_space == "shared":  # some aggregators reject a shared space for some groups of entities
@@ -34,17 +36,28 @@ def build(config: Config) -> "Experiment":
     except ConfigError:
         raise
     except (TypeError, ValueError) as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(" ".join(str(error).split())) from error
 
 
 def build_part(part: str, config: Config) -> Any:
     """Build the task, aggregator or learner of a config; raises a `ConfigError` for impossible values."""
     fields = _with_tuples(config[part])
-    try:
+    with _prefixed(part):
         return registries()[part][fields.pop("name")](**fields)
+
+
+@contextlib.contextmanager
+def _prefixed(part: str, other: str = "", fields: Iterable[str] = ()) -> Iterator[None]:
+    """Turn errors of a constructor into a `ConfigError` that names the key with the part as its prefix.
+
+    Keys in `fields` get the prefix `other` instead.
+    """
+    try:
+        yield
     except (TypeError, ValueError) as error:
-        is_field = re.match(r"\w+: must ", str(error))
-        raise ConfigError(f"{part}{'.' if is_field else ': '}{error}") from error
+        is_field = re.match(r"(\w+): must ", str(error))
+        part = other if is_field and is_field[1] in fields else part
+        raise ConfigError(f"{part}{'.' if is_field else ': '}{' '.join(str(error).split())}") from error
 
 
 def run_settings(config: Config) -> RunSettings:

@@ -78,5 +78,5 @@ def description(group: str, choice: str) -> str:
 
 def unknown_choice(group: str, value: Any, accepted: list[str]) -> ConfigError:
     """Return the error for a value that is no choice of the group."""
-    near = schema.nearest(str(value), accepted)
-    return ConfigError(f"{group}: must be one of {', '.join(accepted)}, got {value!r}{near}")
+    near = schema.nearest(value, accepted) if isinstance(value, str) else ""
+    return ConfigError(f"{group}: must be one of {', '.join(accepted)}, got {schema.shown(value)}{near}")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from jaxswarm.config import renamed, schema
-from jaxswarm.config.groups import REGISTERED, choices, registries, unknown_choice
+from jaxswarm.config.groups import REGISTERED, choices, preset, registries, unknown_choice, user_choices
 from jaxswarm.config.schema import ConfigError
 from jaxswarm.config.settings import LENGTHS, RunSettings
 
@@ -117,9 +117,10 @@ def _part_class(part: str, values: Mapping[str, Any]) -> type:
 
         return ActorCritic
     registry = registries()[part]
-    if values.get("name") not in registry:
-        raise unknown_choice(f"{part}.name", values.get("name"), list(registry))
-    return registry[values["name"]]
+    name = values.get("name")
+    if not isinstance(name, str) or name not in registry:
+        raise unknown_choice(f"{part}.name", name, list(registry))
+    return registry[name]
 
 
 def _check_fields(values: dict, fields: Fields, part: str, config: Config) -> dict:
@@ -143,17 +144,37 @@ def _check_value(value: Any, field: inspect.Parameter, key: str) -> Any:
 
 
 def _unknown_key(key: str, prefix: str, config: Config) -> ConfigError:
-    """Return the error for an unknown key: its present name, or else the nearest key and all valid keys."""
+    """Return the error for an unknown key: its present name, its group's choices, or the nearest and all valid keys."""
     current = renamed.current_key(key)
     if current is not None:
         return ConfigError(f"{key}: renamed to {current}")
     fields = {part: [f"{part}.{name}" for name in part_fields(part, config[part])] for part in PARTS}
     top = [*choices(), *top_fields()]
     every = [*itertools.chain(*fields.values()), *top]
-    same_leaf = [name for name in every if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    leaf = key.rpartition(".")[2]
+    same_leaf = [name for name in every if name.rpartition(".")[2] == leaf]
     accepted = fields[prefix] if prefix else [*top, *(f"{part}.<field>" for part in PARTS)]
-    near = _nearest_key(key, same_leaf or every)
-    return ConfigError(f"unknown key {key!r}{near}; valid keys: {', '.join(accepted)}")
+    ours = renamed.key_of_other_library(key)
+    if ours in every:
+        near = f" (did you mean {ours!r}?)"
+    elif not same_leaf and (owners := _owners(leaf, prefix)):
+        part, names = next(iter(owners.items()))
+        options = " or ".join(f"{part}={name}" for name in names)
+        return ConfigError(f"{part}.{leaf}: must be used with {options}, got {part}.name={config[part]['name']}")
+    else:
+        near = _nearest_key(key, same_leaf or every)
+    return ConfigError(f"unknown key {schema.shown(key)}{near}; valid keys: {', '.join(accepted)}")
+
+
+def _owners(name: str, prefix: str) -> dict[str, list[str]]:
+    """Return the choices whose class has a field of this name, by part; with a `prefix`, only of this part."""
+    owners = {}
+    for part in [prefix] if prefix in REGISTERED else REGISTERED:
+        has_name = {own for own, cls in registries()[part].items() if name in schema.parameters(cls)}
+        users = set(user_choices(part))
+        found = [x for x in choices()[part] if (x if x in users else preset(part, x)["name"]) in has_name]
+        owners |= {part: found} if found else {}
+    return owners
 
 
 def _nearest_key(key: str, keys: list[str]) -> str:

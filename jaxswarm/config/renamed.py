@@ -1,4 +1,4 @@
-"""Keys and values that version 0.1 named differently."""
+"""Keys and values that version 0.1 or other libraries name differently."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +12,56 @@ KEYS = {  # by the name in version 0.1
     "learner.minibatch": "learner.sampling_unit",
 }
 VALUES = {("learner.sampling_unit", "worlds"): "envs", ("task.relative_velocity", "normalised"): "normalized"}
+
+OF_OTHER_LIBRARIES = {  # by the name in Stable-Baselines3, CleanRL, JaxMARL, rejax, RLlib or Gymnasium, in lower case
+    "lr": "learner.learning_rate",
+    "actor_lr": "learner.learning_rate",
+    "gamma": "learner.discount",
+    "discount_factor": "learner.discount",
+    "lam": "learner.gae_lambda",
+    "lambda": "learner.gae_lambda",
+    "lambda_": "learner.gae_lambda",
+    "clip_eps": "learner.clip_range",
+    "clip_coef": "learner.clip_range",
+    "clip_param": "learner.clip_range",
+    "clip_ratio": "learner.clip_range",
+    "ent_coef": "learner.entropy_coefficient",
+    "entropy_coeff": "learner.entropy_coefficient",
+    "vf_coef": "learner.value_coefficient",
+    "value_coef": "learner.value_coefficient",
+    "vf_loss_coeff": "learner.value_coefficient",
+    "grad_clip": "learner.max_grad_norm",
+    "n_epochs": "learner.num_epochs",
+    "epochs": "learner.num_epochs",
+    "update_epochs": "learner.num_epochs",
+    "minibatch_size": "learner.batch_size",
+    "num_minibatches": "learner.batch_size",
+    "n_envs": "num_envs",
+    "num_env_runners": "num_envs",
+    "n_steps": "num_steps",
+    "rollout_length": "num_steps",
+    "rollout_fragment_length": "num_steps",
+    "total_timesteps": "total_agent_steps",
+    "timesteps": "total_agent_steps",
+    "num_timesteps": "total_agent_steps",
+    "eval_freq": "eval_every",
+    "n_eval_episodes": "num_eval_envs",
+    "n_agents": "task.num_agents",
+    "max_episode_steps": "task.episode_length",
+    "max_steps": "task.episode_length",
+    "env": "task",
+    "env_id": "task",
+    "env_name": "task",
+    "algo": "learner",
+    "hidden_size": "network.encoder",
+    "hidden_sizes": "network.encoder",
+    "net_arch": "network.encoder",
+}
+
+
+def key_of_other_library(key: str) -> str | None:
+    """Return our name of a key that another library uses, with or without a prefix; `None` for other keys."""
+    return OF_OTHER_LIBRARIES.get(key.rpartition(".")[2].lower())
 
 
 def current_key(key: str) -> str | None:
@@ -32,6 +82,22 @@ def translate_override(text: str) -> str:
     full = {new.rpartition(".")[2]: new for new, _ in VALUES}.get(key, key)
     values = [current_value(full, x) or x for x in value.split(",")]
     return f"{key}{equals}{','.join(values)}"
+
+
+def translate_space(space: dict[str, Any], is_key: Callable[[str], bool]) -> tuple[dict[str, Any], list[str]]:
+    """Return the search space with present names, and one text "old -> new" for each name of version 0.1 in it.
+
+    `is_key(key)` says whether a key of version 0.1 is a key of the searched config, so that it must not be translated.
+    """
+    result, changes = {}, []
+    for old, choice in space.items():
+        key = old if is_key(old) else current_key(old) or old
+        full = KEYS.get(old, key)
+        values = [current_value(full, x) or x for x in choice] if isinstance(choice, list) else choice
+        if (key, values) != (old, choice):
+            changes.append(f"{old} -> {key}" if key != old else f"values of {key}")
+        result[key] = values
+    return result, changes
 
 
 def translate(config: dict[str, Any], has_field: Callable[[str, str], bool]) -> tuple[dict[str, Any], list[str]]:

@@ -4,9 +4,12 @@ import dataclasses
 import math
 from typing import Literal
 
-from jaxswarm.config.schema import ConfigError
+from jaxswarm.config.schema import ConfigError, is_number, shown
+from jaxswarm.limits import LARGER_INTEGERS, MAX_INTEGER, MAX_NUMBER
 
 LENGTHS = ("num_updates", "total_agent_steps")  # two units for the length of a run
+LEAST = {"seed": 0, "checkpoint_seconds": 0}  # of the numbers that may be less than 1
+MOST = {"num_seeds": 2**16, "checkpoint_seconds": MAX_NUMBER, **LARGER_INTEGERS}  # of those not below 2**31
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,9 +51,9 @@ class RunSettings:
             raise ConfigError(f"num_updates and total_agent_steps: exactly one must be set, got {given}")
         for field in dataclasses.fields(self):
             name, value = field.name, getattr(self, field.name)
-            bound = 0 if name in ("seed", "checkpoint_seconds") else 1
-            if isinstance(value, int | float) and value < bound:
-                raise ConfigError(f"{name}: must be a number >= {bound}, got {value!r}")
+            least, most = LEAST.get(name, 1), MOST.get(name, MAX_INTEGER)
+            if is_number(value) and not least <= value <= most:
+                raise ConfigError(f"{name}: must be a number from {least} to {most:.16g}, got {shown(value)}")
         if self.seed + self.num_seeds > 2**32:
             raise ConfigError(f"seed: seed + num_seeds must be at most 2**32, got {self.seed} + {self.num_seeds}")
 
@@ -60,8 +63,15 @@ class RunSettings:
         return tuple(range(self.seed, self.seed + self.num_seeds))
 
     def length(self, agent_steps_per_update: int) -> int:
-        """Return the number of updates. `total_agent_steps` is rounded up to whole updates."""
+        """Return the number of updates. `total_agent_steps` is rounded up to whole updates.
+
+        Raises a `ConfigError` for more updates than a 32-bit counter can hold.
+        """
         if self.num_updates is not None:
             return self.num_updates
         assert self.total_agent_steps is not None
+        most = MAX_INTEGER * agent_steps_per_update
+        if self.total_agent_steps > most:
+            accepted = f"at most {most}, which is {MAX_INTEGER} updates of {agent_steps_per_update} agent steps"
+            raise ConfigError(f"total_agent_steps: must be {accepted}, got {self.total_agent_steps}")
         return math.ceil(self.total_agent_steps / agent_steps_per_update)

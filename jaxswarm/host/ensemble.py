@@ -166,7 +166,7 @@ def compile_batch(batch: RunBatch, states: TrainState, size: int, warn: Callable
         with _on(batch):
             lowered = _advance.lower(batch.experiments, states, np.int32(0), size, width, batch.mesh)
             program = lowered.compile(compiler_options())
-        needed, free = _memory(program), _free_memory()
+        needed, free = _memory(program), free_memory()
         if needed <= free:
             break
         sizes = f"{needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free"
@@ -278,7 +278,7 @@ def _allotted(folder: Path = Path("/sys/fs/cgroup")) -> float:
     return math.inf
 
 
-def _free_memory() -> float:
+def free_memory() -> float:
     """Return the bytes that a program may use on each device; infinite if unknown."""
     if jax.default_backend() == "cpu":
         return MEMORY_SHARE * min(psutil.virtual_memory().available, _allotted()) / jax.local_device_count()

@@ -20,9 +20,9 @@ import numpy as np
 
 from jaxswarm import config as configs
 from jaxswarm import files, render
-from jaxswarm.config import ConfigError, RunSettings
+from jaxswarm.config import RunSettings
 from jaxswarm.files import Row
-from jaxswarm.host import ensemble, loggers, trained
+from jaxswarm.host import ensemble, estimate, loggers, trained
 from jaxswarm.host.batch_recorder import BatchRecorder, Chunk, DivergedError
 from jaxswarm.host.checkpoint import Restored
 from jaxswarm.host.ensemble import RunBatch, abstract_state
@@ -32,7 +32,7 @@ from jaxswarm.host.recorder import Recorder, plot_curve
 from jaxswarm.host.resume import ResumePoint, final_lines, resume_points
 from jaxswarm.host.run import Run, check_folder, locked, split_started
 from jaxswarm.host.signals import stop_requests
-from jaxswarm.training import Experiment, TrainState
+from jaxswarm.training import Experiment, TrainState, init
 
 __all__ = ["DivergedError", "fit", "fit_runs"]
 
@@ -113,6 +113,7 @@ def fit_runs(
         check_folder(run, resume, force)
         for name in run.settings.loggers:
             loggers.import_package(name)
+    estimate.check_training(runs[0].experiment, sum(len(run.seeds) for run in runs))
     runs = [_prepared(run) for run in runs]
     started, new = split_started([run.run_dir for run in runs if run.run_dir])
     if started and new:
@@ -133,12 +134,14 @@ def _prepared(run: Run) -> Run:
     if params is None and run.run_dir:
         params = trained.warm_start(run.settings, run.run_dir)
     if params is not None:
-        _check_params(run, params)
+        needed = jax.eval_shape(init, run.experiment, jax.random.key(0)).learner.params
+        trained.check_params(params, needed, run.settings.init_from)
     if on_evaluation is None and run.run_dir and run.settings.render_every:
         on_evaluation = render.hook(run.run_dir, run.experiment, run.settings.render_every)
     return dataclasses.replace(run, init_params=params, on_evaluation=on_evaluation)
 
 
+<<<<<<< HEAD
 def _check_params(run: Run, params: Any) -> None:
     """Raise a `ConfigError` for parameters that do not fit the run's network."""
     needed = abstract_state(run.experiment).learner.params
@@ -150,6 +153,9 @@ def _check_params(run: Run, params: Any) -> None:
 
 
 def _fit(runs: Sequence[Run], points: list[ResumePoint] | None, progress: bool) -> tuple[TrainState, list[list[Row]]]:
+=======
+def _fit(runs: Sequence[Run], resume: bool, progress: bool) -> tuple[TrainState, list[list[Row]]]:
+>>>>>>> lines
     """Train runs whose folders are locked."""
     is_first = jax.process_index() == 0  # of several processes, only the first one writes and prints
     num_updates = runs[0].num_updates

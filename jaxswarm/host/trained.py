@@ -14,6 +14,8 @@ from jaxswarm.host.ensemble import abstract_state
 from jaxswarm.host.run import has_checkpoint, load_config
 from jaxswarm.training import Experiment
 
+MAX_NAMED = 4  # arrays that a message about shapes lists
+
 
 class TrainedPolicies(NamedTuple):
     """The policies of several seeds of an experiment, and the update that they were saved at."""
@@ -56,9 +58,37 @@ def warm_start(settings: RunSettings, run_dir: Path) -> Any:
     """
     if settings.init_from is None or has_checkpoint(run_dir):
         return None
-    if not (Path(settings.init_from) / "config.yaml").is_file():
-        raise ConfigError(f"init_from: must be a run folder, got {settings.init_from!r}")
+    require_warm_start(settings)
     return load(settings.init_from)[1]
+
+
+def require_warm_start(settings: RunSettings) -> None:
+    """Raise a `ConfigError` if `init_from` is set and no run folder."""
+    if settings.init_from is not None and not (Path(settings.init_from) / "config.yaml").is_file():
+        raise ConfigError(f"init_from: must be a run folder, got {settings.init_from!r}")
+
+
+def check_params(params: Any, needed: Any, init_from: str | None) -> None:
+    """Raise a `ConfigError` that lists the arrays whose shapes differ from the needed ones.
+
+    `init_from` is the run folder that the parameters are from; `None`: they are the argument `init_params` of `fit`.
+    """
+    given, wanted = _shapes_by_name(params), _shapes_by_name(needed)
+    names = [name for name in {**wanted, **given} if given.get(name) != wanted.get(name)]
+    if not names:
+        return
+    shown = [f"{name} is {given.get(name, 'missing')}, needed {wanted.get(name, 'no such array')}" for name in names]
+    more = f" and {len(shown) - MAX_NAMED} more" if len(shown) > MAX_NAMED else ""
+    source = "init_params" if init_from is None else f"init_from={init_from}"
+    raise ConfigError(
+        f"{source}: must have the parameter shapes of this network, but {'; '.join(shown[:MAX_NAMED])}{more}; "
+        "train the warm start with the same network, observation features and actions"
+    )
+
+
+def _shapes_by_name(params: Any) -> dict[str, tuple[int, ...]]:
+    leaves = jax.tree.leaves_with_path(params)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): np.shape(x) for path, x in leaves}
 
 
 def load_policies(

@@ -3,7 +3,8 @@
 from jaxswarm.learners.ppo import PPO
 from jaxswarm.learners.projections import PROJECTIONS
 from jaxswarm.learners.trl import TRL
+from jaxswarm.registry import Registry
 
-LEARNERS = {"ppo": PPO, "trl": TRL}
+LEARNERS = Registry("learner", {"ppo": PPO, "trl": TRL})
 
 __all__ = ["LEARNERS", "PPO", "PROJECTIONS", "TRL"]

@@ -4,6 +4,11 @@ Runs that differ only in numeric hyperparameters are vectorized in one program; 
 """
 
 import dataclasses
+<<<<<<< HEAD
+=======
+import io
+import math
+>>>>>>> lines
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +22,12 @@ from jaxswarm.analysis import run_folders as folders
 from jaxswarm.analysis import summaries
 from jaxswarm.analysis.comparability import Comparison, compare
 from jaxswarm.config import Config, ConfigError
+<<<<<<< HEAD
 from jaxswarm.files import Row
+=======
+from jaxswarm.config.overrides import MAX_COMBINATIONS
+from jaxswarm.files import RETURN, Row, replace_text
+>>>>>>> lines
 from jaxswarm.host.run import Run
 
 RANGE = re.compile(r"(?P<low>[^,]+?)\.\.(?P<high>[^,:]+):(?P<count>\d+) ?(?P<log>log)?$")
@@ -25,8 +35,13 @@ RANGE = re.compile(r"(?P<low>[^,]+?)\.\.(?P<high>[^,:]+):(?P<count>\d+) ?(?P<log
 
 def expand(overrides: Sequence[str]) -> list[Config]:
     """Return the config of every combination of values in overrides such as `key=a,b` or `key=1e-4..1e-3:5 log`."""
-    combinations = configs.combinations([_listed(word) for word in overrides])
-    return [configs.compose_pairs(pairs) for pairs in combinations]
+    overrides = [_listed(word) for word in overrides]
+    for word in overrides:
+        key = word.partition("=")[0]
+        if key in folders.NOT_COMPARED and len(configs.combinations([word])) > 1:
+            hint = "train several seeds with num_seeds=N" if "seed" in key else "sweep other keys"
+            raise ConfigError(f"{key}: must have one value in a sweep, got {word.partition('=')[2]}; {hint}")
+    return [configs.compose_pairs(pairs) for pairs in configs.combinations(overrides)]
 
 
 def runs(wanted: Sequence[Config], sweep_dir: Path) -> list[Run]:
@@ -105,10 +120,12 @@ def _listed(word: str) -> str:
         return word
     try:
         low, high, count = float(found["low"]), float(found["high"]), int(found["count"])
-        if count < 2 or (found["log"] and min(low, high) <= 0):
+        is_valid = count >= 2 and math.isfinite(high - low) and not (found["log"] and min(low, high) <= 0)
+        if not is_valid or count > MAX_COMBINATIONS:
             raise ValueError
     except ValueError:
-        accepted = "low..high:count or 'low..high:count log' with count >= 2 and, for log, positive numbers"
+        counts = f"2 <= count <= {MAX_COMBINATIONS}"
+        accepted = f"low..high:count or 'low..high:count log' with {counts} and, for log, positive numbers"
         raise ConfigError(f"{key}: must be {accepted}, got {value!r}") from None
     numbers = np.geomspace(low, high, count) if found["log"] else np.linspace(low, high, count)
     is_integer = all(float(x).is_integer() for x in (low, high)) and all(abs(x - round(x)) < 1e-9 for x in numbers)

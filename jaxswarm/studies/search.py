@@ -4,7 +4,11 @@ Each trial is a run folder with several seeds, which are vectorized. The value o
 returns during training, over all seeds. The thesis maximized the same value, which rewards good and fast learning.
 """
 
+import json
 import math
+import shlex
+import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxswarm import config as configs
-from jaxswarm.config import Config, ConfigError
+from jaxswarm.config import Config, ConfigError, renamed
 from jaxswarm.files import RETURN, Row
 from jaxswarm.learners.on_policy import nearest_batch_sizes
 
@@ -23,6 +27,8 @@ BATCH_SIZE = "learner.batch_size"
 RESUMES = "resumes"  # attribute of a trial that resumes an interrupted one: the number of that trial
 REQUEUED = "requeued"  # attribute that version 0.1 gave interrupted trials instead
 RUN_DIR = "run_dir"  # attribute of a trial: its run folder
+
+WRITE_SECONDS = 0.5  # longer than the writing of a line of a journal
 
 Space = dict[str, Any]  # the choice for each key: a list of values or a range
 
@@ -48,6 +54,9 @@ def load_space(name: str, config: Config) -> Space:
     if not all(isinstance(x, dict) for x in (parameters, of_aggregators, *getattr(of_aggregators, "values", list)())):
         raise ConfigError(f"{path}: must have the form parameters: {{key: choice}}, aggregator: {{name: {{...}}}}")
     space = parameters | of_aggregators.get(config["aggregator"]["name"], {})
+    space, changes = renamed.translate_space(space, configs.flat(config).__contains__)
+    if changes:
+        print(f"{path} was written for jaxswarm 0.1; its keys were translated: {', '.join(changes)}", file=sys.stderr)
     for key, choice in space.items():
         _check(key, choice)
     return space
@@ -65,12 +74,42 @@ def open_study(storage: str, name: str = "jaxswarm") -> "optuna.Study":
         raise ConfigError('search needs Optuna; install it with: pip install "jaxswarm[search]"') from error
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    if "://" not in storage:
+        _check_journal(Path(storage))
     try:
         opened = storage if "://" in storage else optuna.storages.JournalStorage(JournalFileBackend(storage))
         return optuna.create_study(storage=opened, study_name=name, direction="maximize", load_if_exists=True)
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"storage: must be a database URL or a journal file, got {storage!r} ({reason})") from error
+
+
+def _check_journal(path: Path) -> None:
+    """Raise a `ConfigError` for a line that a killed process has left incomplete, because Optuna cannot read it."""
+    number = _invalid_line(path)
+    if number is not None:
+        time.sleep(WRITE_SECONDS)  # another process may be writing this line
+        number = _invalid_line(path)
+    if number is not None:
+        repair = f"sed -i {number}d {shlex.quote(str(path))}"
+        cause = "a process was killed while it wrote this line"
+        raise ConfigError(
+            f"storage: line {number} of {path} must be complete JSON; {cause}. "
+            f"Stop all processes of the search, and remove the line with: {repair}"
+        )
+
+
+def _invalid_line(path: Path) -> int | None:
+    """Return the number of the first incomplete line of a journal, counted from 1; `None` if there is none."""
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    for number, line in enumerate(lines, 1):
+        try:
+            is_valid = line.endswith(b"\n") and isinstance(json.loads(line), dict)
+        except ValueError:
+            is_valid = False
+        if not is_valid:
+            return number
+    return None
 
 
 def ask(study: "optuna.Study", seed: int) -> "optuna.Trial":

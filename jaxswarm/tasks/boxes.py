@@ -18,6 +18,7 @@ from jaxswarm.tasks.arena import Arena, State, View
 from jaxswarm.tasks.swarm import NumberRange
 from jaxswarm.types import Comparable, Entities, Key, Metrics, Observation, Step, pytree, static
 
+MAX_BODIES = 1000  # robots or boxes; tables of all pairs are built when the physics is traced
 CORNERS = ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))  # corner of each cluster, in units of the side
 
 
@@ -37,7 +38,8 @@ def _with_final_values(is_over: Bool[Array, ""], metrics: Metrics) -> Metrics:
 
 
 def _check_fields(task: "Assembly | Clustering") -> None:
-    require(task, checks.integer(1), "num_agents", "num_boxes", "episode_length")
+    require(task, checks.integer(1), "episode_length")
+    require(task, checks.size(1, MAX_BODIES), "num_agents", "num_boxes")
     fits_a_box = checks.Check(
         f"a finite number >= {2 * BOX_SIDE}, so that a box fits", lambda x: 2 * BOX_SIDE <= x < math.inf
     )

@@ -106,7 +106,7 @@ class Pursuit:
 
     def __post_init__(self) -> None:
         swarm.require_swarm(self, least=1)
-        require(self, checks.integer(1), "num_evaders")
+        require(self, checks.size(1), "num_evaders")
         require(self, checks.optional(checks.integer_range(1, self.num_evaders)), "active_evaders")
         require(self, checks.POSITIVE_FINITE, "evader_visibility_radius")
         require(self, checks.choice(CATCH_DISTANCE), "reward")

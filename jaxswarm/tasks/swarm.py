@@ -30,9 +30,9 @@ def require_swarm(task: Any, least: int) -> None:
 
     Raises a `ValueError` that names the field.
     """
-    require(task, checks.integer(least), "num_agents")
+    require(task, checks.size(least), "num_agents")
     require(task, checks.integer(1), "episode_length")
-    require(task, checks.optional(checks.integer(1)), "max_neighbors")
+    require(task, checks.optional(checks.size(1)), "max_neighbors")
     require(task, checks.POSITIVE_FINITE, "side", "visibility_radius")
     require(task, checks.BOOL, "torus")
     require(task, checks.optional(checks.integer_range(least, task.num_agents)), "active_agents")
