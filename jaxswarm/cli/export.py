@@ -65,18 +65,12 @@ def main(arguments: Sequence[str]) -> int:
 
     task, network, params, update = found
     exported = export.export_policy(task, network, params)
-<<<<<<< HEAD
-    out.parent.mkdir(parents=True, exist_ok=True)
-    files.replace_bytes(out, bytes(exported.serialize()))
-    print(f"wrote {out} ({files.size_text(out)}), the policy after update {update}")
-=======
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         files.replace_bytes(out, bytes(exported.serialize()))
     except OSError as error:
         raise ConfigError(f"out: cannot write to {out}: {error.strerror}") from error
-    print(f"wrote {out} ({out.stat().st_size / 1e6:.2f} MB), the policy after update {update}")
->>>>>>> lines
+    print(f"wrote {out} ({files.size_text(out)}), the policy after update {update}")
     own, groups = jax.tree.unflatten(exported.in_tree, map(str, exported.in_avals))[0]
     print(USE.format(path=out, own=own, groups=str(groups).replace("'", "")))
     return 0

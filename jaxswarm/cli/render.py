@@ -77,11 +77,7 @@ def main(arguments: Sequence[str]) -> int:
         raise ConfigError(f"out: cannot write to {out}: {error.strerror}") from error
     for film in films:
         print(f"{film.title}: {film.num_frames - 1} steps, return {film.score[-1]:.2f}")
-<<<<<<< HEAD
-    print(f"wrote {out} ({size_text(out)})")
-=======
-    print(f"{'replaced' if is_replaced else 'wrote'} {out} ({out.stat().st_size / 1e6:.1f} MB)")
->>>>>>> lines
+    print(f"{'replaced' if is_replaced else 'wrote'} {out} ({size_text(out)})")
     return 0
 
 

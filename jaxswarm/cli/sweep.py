@@ -9,13 +9,8 @@ from typing import TYPE_CHECKING
 
 from jaxswarm import config as configs
 from jaxswarm.cli import plot
-<<<<<<< HEAD
-from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help
-from jaxswarm.config import ConfigError, plugins, renamed
-=======
 from jaxswarm.cli.program import command, parse_integer, program, split, use_compile_cache, wants_help, warn
-from jaxswarm.config import ConfigError, renamed
->>>>>>> lines
+from jaxswarm.config import ConfigError, plugins, renamed
 from jaxswarm.files import claim_folder, is_vacant, read_text, removed_if_empty
 
 if TYPE_CHECKING:

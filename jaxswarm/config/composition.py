@@ -49,18 +49,10 @@ def activate(content: Config, run_dir: Path) -> Config:
 
     Raises a `ConfigError`.
     """
-<<<<<<< HEAD
     imports = content.get("imports")
     if isinstance(imports, list) and all(isinstance(one, str) for one in imports):  # otherwise, `validate` raises
         plugins.run_stored(imports, run_dir)
     return validate(content)
-=======
-    config = read_yaml(path)
-    imports = config.get("imports")
-    is_list = isinstance(imports, list) and all(isinstance(one, str) for one in imports)
-    plugins.run(plugins.locate(imports, path.parent) if is_list else imports or [])
-    return validate(_translate(config, path))
->>>>>>> lines
 
 
 def read(path: Path) -> Config:

@@ -67,7 +67,7 @@ def check(value: Any, annotation: Any, name: str) -> Any:
     raise ConfigError(f"{name}: must be {_describe(annotation)}, got {shown(value)}{_spelling(value, annotation)}")
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> typing.TypeGuard[int | float]:
     """Return whether a value is an integer or a float; booleans are neither."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 

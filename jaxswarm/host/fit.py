@@ -25,7 +25,7 @@ from jaxswarm.files import Row
 from jaxswarm.host import ensemble, estimate, loggers, trained
 from jaxswarm.host.batch_recorder import BatchRecorder, Chunk, DivergedError
 from jaxswarm.host.checkpoint import Restored
-from jaxswarm.host.ensemble import RunBatch, abstract_state
+from jaxswarm.host.ensemble import RunBatch
 from jaxswarm.host.metrics_log import MetricsLog
 from jaxswarm.host.progress import Progress
 from jaxswarm.host.recorder import Recorder, plot_curve
@@ -141,21 +141,7 @@ def _prepared(run: Run) -> Run:
     return dataclasses.replace(run, init_params=params, on_evaluation=on_evaluation)
 
 
-<<<<<<< HEAD
-def _check_params(run: Run, params: Any) -> None:
-    """Raise a `ConfigError` for parameters that do not fit the run's network."""
-    needed = abstract_state(run.experiment).learner.params
-    if jax.tree.map(np.shape, params) != jax.tree.map(lambda x: x.shape[1:], needed):
-        raise ConfigError(
-            "init_params: must have the parameter shapes of this network; "
-            "train the warm start with the same network, observation features and actions"
-        )
-
-
 def _fit(runs: Sequence[Run], points: list[ResumePoint] | None, progress: bool) -> tuple[TrainState, list[list[Row]]]:
-=======
-def _fit(runs: Sequence[Run], resume: bool, progress: bool) -> tuple[TrainState, list[list[Row]]]:
->>>>>>> lines
     """Train runs whose folders are locked."""
     is_first = jax.process_index() == 0  # of several processes, only the first one writes and prints
     num_updates = runs[0].num_updates

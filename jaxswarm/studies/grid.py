@@ -4,11 +4,7 @@ Runs that differ only in numeric hyperparameters are vectorized in one program; 
 """
 
 import dataclasses
-<<<<<<< HEAD
-=======
-import io
 import math
->>>>>>> lines
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,12 +18,8 @@ from jaxswarm.analysis import run_folders as folders
 from jaxswarm.analysis import summaries
 from jaxswarm.analysis.comparability import Comparison, compare
 from jaxswarm.config import Config, ConfigError
-<<<<<<< HEAD
-from jaxswarm.files import Row
-=======
 from jaxswarm.config.overrides import MAX_COMBINATIONS
-from jaxswarm.files import RETURN, Row, replace_text
->>>>>>> lines
+from jaxswarm.files import Row
 from jaxswarm.host.run import Run
 
 RANGE = re.compile(r"(?P<low>[^,]+?)\.\.(?P<high>[^,:]+):(?P<count>\d+) ?(?P<log>log)?$")
