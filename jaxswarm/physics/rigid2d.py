@@ -33,13 +33,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxswarm.physics.collisions import find_contacts, hold_discs, no_impulses
-from jaxswarm.physics.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver
+from jaxswarm.physics.contacts import BOX_SIDE, DISC_RADIUS, DRAG, TICK, Contact, Motion, Motions, Pose, Solver
 from jaxswarm.types import pytree
 
 # Boxes that are pressed together overlap by up to 0.2 mm in the first, and by some millimeters in the second.
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5, max_overlap=5e-4)}
 
 GROWTH = 0.05  # share of `Solver.max_overlap` by which overlaps may grow per substep
+CROWDED = 0.06  # share of the floor that bodies cover, above which `settle` takes further rounds
 SETTLING_ROUNDS = 100  # most rounds of substeps of `settle`
 
 BLOCK = 64  # environments; measured in benchmarks/LOG.md
@@ -176,7 +177,8 @@ def _run(
     if has_inertia:
         bodies = jax.lax.fori_loop(0, num_substeps, substep, bodies)
     else:
-        bodies = _settle(solver, num_substeps, substep, bodies)
+        is_crowded = _cover(disc.x, present) > CROWDED * side**2
+        bodies = _settle(solver, num_substeps, substep, is_crowded, bodies)
     disc, box, velocity = bodies.disc, bodies.box, bodies.velocity
     return (
         jnp.stack([disc.x, disc.y], 1),
@@ -187,14 +189,21 @@ def _run(
     )
 
 
-def _settle(solver: Solver, num_substeps: int, substep: Callable, bodies: _Bodies) -> _Bodies:
-    """Take one round of substeps, and further rounds in environments with an overlap beyond `Solver.max_overlap`."""
+def _cover(disc: Float[Array, "discs *envs"], present: Float[Array, "boxes *envs"]) -> Float[Array, "*envs"]:
+    """Return the area in square meters that discs and present boxes cover."""
+    return math.pi * DISC_RADIUS**2 * len(disc) + BOX_SIDE**2 * present.sum(0)
+
+
+def _settle(
+    solver: Solver, num_substeps: int, substep: Callable, is_crowded: Bool[Array, "*envs"], bodies: _Bodies
+) -> _Bodies:
+    """Take one round of substeps, and further rounds in crowded environments with deep overlaps."""
 
     def one_round(index: Array | int, bodies: _Bodies) -> _Bodies:
         def advance(bodies: _Bodies) -> _Bodies:
             return _where(is_unsettled, jax.lax.fori_loop(0, num_substeps, substep, bodies), bodies)
 
-        is_unsettled = (index == 0) | (bodies.depth > solver.max_overlap)
+        is_unsettled = (index == 0) | (is_crowded & (bodies.depth > solver.max_overlap))
         return jax.lax.cond(_any_env(is_unsettled), advance, lambda bodies: bodies, bodies)
 
     return jax.lax.fori_loop(0, SETTLING_ROUNDS, one_round, bodies)
@@ -252,23 +261,31 @@ def _solve(
 ) -> tuple[Motions, dict[str, Array]]:
     """Take one round of sweeps, and further rounds in environments where a deep overlap would still grow."""
 
-    def is_growing(motions: Motions) -> Bool[Array, "*envs"]:
+    def growing(motions: Motions) -> Float[Array, "*envs"]:
         growth = [contact.growth(solver, motions) for contact in contacts.values()]
-        return _deepest(growth) > GROWTH * solver.max_overlap
+        return 1.0 * (_deepest(growth) > GROWTH * solver.max_overlap)
 
-    def advance(carry: tuple) -> tuple:
-        is_behind, *before = carry
-        after = _where(is_behind, _sweep(solver, stage, contacts, hold, *before), tuple(before))
-        is_behind = jax.lax.cond(is_any_deep, is_growing, lambda _: jnp.zeros_like(is_behind), after[0])
-        return is_behind, *after
+    def one_round(carry: tuple) -> tuple:
+        index, is_behind, motions, impulses = carry
+        motions, impulses = _sweep(solver, stage, contacts, hold, is_behind, motions, impulses)
+        is_behind = jax.lax.cond(is_any_deep, growing, lambda _: 0 * is_behind, motions)
+        return index + 1, is_behind, motions, impulses
 
-    def one_round(_: Array | int, carry: tuple) -> tuple:
-        return jax.lax.cond(_any_env(carry[0]), advance, lambda carry: carry, carry)
+    def is_unfinished(carry: tuple) -> Bool[Array, ""]:
+        return (carry[0] < solver.rounds) & _any_env(carry[1] > 0)
 
     is_any_deep = _any_env(depth > solver.max_overlap)
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
     start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
-    _, motions, impulses_and_slips = jax.lax.fori_loop(0, solver.rounds, one_round, (depth >= 0, motions, start))
+    carry = (jnp.array(0), jnp.ones_like(depth) + 0 * depth, motions, start)
+    if stage.func is _apart:
+        *_, motions, impulses_and_slips = jax.lax.while_loop(is_unfinished, one_round, carry)
+    else:  # derivatives need a fixed number of rounds
+
+        def again(_: Array | int, carry: tuple) -> tuple:
+            return jax.lax.cond(is_unfinished(carry), one_round, lambda carry: carry, carry)
+
+        *_, motions, impulses_and_slips = jax.lax.fori_loop(0, solver.rounds, again, carry)
     return motions, {kind: impulse for kind, (impulse, _) in impulses_and_slips.items()}
 
 
@@ -277,10 +294,11 @@ def _sweep(
     stage: Callable,
     contacts: dict[str, Contact],
     hold: Callable[[Motion], Motion],
+    is_behind: Float[Array, "*envs"],
     motions: Motions,
     impulses: dict[str, tuple],
 ) -> tuple[Motions, dict[str, tuple]]:
-    """Sweep over all kinds of contact, from the stiffest to the softest.
+    """Sweep over all kinds of contact, from the stiffest to the softest, where `is_behind` is 1; elsewhere it is 0.
 
     Contacts between discs are solved twice per sweep, and walls stop discs after each time, because piles of discs
     separate most slowly.
@@ -288,15 +306,16 @@ def _sweep(
 
     def sweep(index: Array | int, carry: tuple) -> tuple:
         motions, before = carry
-        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
+        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0) * is_behind
         after = dict(before)
         for kind in (*contacts, "disc_disc"):
             contact, last = contacts[kind], after[kind]
             moved = {body: motions[body] for body in contact.bodies}
-            after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
+            after[kind] = stage(partial(contact.answer, relaxation, is_behind), moved, *last)
             motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
             if kind == "disc_disc":
-                motions = motions | {"disc": hold(motions["disc"])}
+                held = hold(motions["disc"])
+                motions = motions | {"disc": _where(is_behind > 0, held, motions["disc"])}
         return motions, after
 
     return jax.lax.fori_loop(0, solver.iterations, sweep, (motions, impulses))
