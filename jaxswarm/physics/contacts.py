@@ -13,6 +13,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -64,12 +65,14 @@ class Solver:
     box_friction: float = 0.01  # coefficient between boxes; discs are frictionless
     wall_friction: float = 0.0447  # between boxes and walls
     offsets: Offsets = BOX2D_OFFSETS
+    max_overlap: float = 1e-3  # m; a substep that would deepen an overlap beyond it takes further rounds of sweeps
+    rounds: int = 12  # most rounds of `iterations` sweeps per substep
 
     def __post_init__(self) -> None:
-        require(self, checks.integer(1), "substeps", "iterations")
+        require(self, checks.integer(1), "substeps", "iterations", "rounds")
         require(self, checks.Check("a number above 0 and below 2", lambda x: 0 < x < 2), "relaxation")
         require(self, checks.Check("a number above 0, up to 1", lambda x: 0 < x <= 1), "recovery", "box_recovery")
-        require(self, checks.POSITIVE, "max_speed")
+        require(self, checks.POSITIVE, "max_speed", "max_overlap")
         require(self, checks.NOT_NEGATIVE, "box_friction", "wall_friction")
 
     @property
@@ -243,10 +246,21 @@ def total(rows: Array, axis: int) -> Array:
 
     XLA on a CPU does not vectorize loops over a few leading rows; unrolled, they take at most a third of the time.
     """
+    return _fold(operator.add, jnp.sum, rows, axis)
+
+
+def greatest(rows: Float[Array, "points row own *envs"]) -> Float[Array, "*envs"]:
+    """Return the greatest value of each environment, at least 0."""
+    for _ in range(3):
+        rows = _fold(jnp.maximum, partial(jnp.max, initial=0.0), rows, 0)
+    return jnp.maximum(rows, 0)
+
+
+def _fold(combine: Callable, reduce: Callable, rows: Array, axis: int) -> Array:
     if not 0 < rows.shape[axis] <= 32:
-        return rows.sum(axis)
+        return reduce(rows, axis)
     terms = [jax.lax.index_in_dim(rows, i, axis, False) for i in range(rows.shape[axis])]
-    return functools.reduce(operator.add, terms)
+    return functools.reduce(combine, terms)
 
 
 @pytree
@@ -277,15 +291,24 @@ class Contact:
         return dataclasses.replace(self, normal=dataclasses.replace(self.normal, mass=mass), tangent=tangent)
 
     def answer(
-        self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
+        self,
+        relaxation: Float[Array, "*envs"],
+        slip_relaxation: Float[Array, "*envs"],
+        motions: Motions,
+        impulse: Array,
+        slip: Array | None,
     ) -> tuple[Array, Array | None]:
-        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`."""
+        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`.
+
+        With relaxations of 0 they stay the previous ones.
+        """
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
-        impulse = jnp.maximum(impulse - relaxation * error, 0)
+        impulse = jnp.maximum(impulse - relaxation[None, None, None] * error, 0)
         if self.tangent is None or slip is None:
             return impulse, None
         limit = self.friction * total(impulse, 0)[None]
-        return impulse, jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
+        error = self.tangent.mass * self.tangent.velocity(motions)
+        return impulse, jnp.clip(slip - slip_relaxation[None, None, None] * error, -limit, limit)
 
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
         """Return the motions after these impulses."""
@@ -293,6 +316,15 @@ class Contact:
         if self.tangent is not None and slip is not None:
             force = Force(*jax.tree.map(operator.add, force, self.tangent.force(slip)))
         return self.normal.push(solver, motions, force)
+
+    def depth(self) -> Float[Array, "*envs"]:
+        """Return the deepest overlap in meters, at least 0."""
+        return greatest(-self.gap * self.normal.near)
+
+    def growth(self, solver: Solver, motions: Motions) -> Float[Array, "*envs"]:
+        """Return by how many meters a substep with these motions deepens an overlap beyond `Solver.max_overlap`."""
+        gap = self.gap + solver.duration * self.normal.velocity(motions)
+        return greatest((jnp.minimum(self.gap, -solver.max_overlap) - gap) * self.normal.near)
 
     @property
     def bodies(self) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ The moved states have these fields, in meters, radians and seconds, in a square 
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -29,14 +30,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxswarm.physics.collisions import find_contacts, hold_discs, no_impulses
-from jaxswarm.physics.contacts import DRAG, TICK, Contact, Motion, Motions, Pose, Solver
+from jaxswarm.physics.contacts import BOX_SIDE, DISC_RADIUS, DRAG, TICK, Contact, Motion, Motions, Pose, Solver
 from jaxswarm.types import pytree
 
 # Boxes that are pressed together overlap by up to 0.2 mm in the first, and by some millimeters in the second.
-PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5)}
+PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5, max_overlap=5e-4)}
+
+GROWTH = 0.05  # share of `Solver.max_overlap` by which overlaps may grow per substep
+CROWDED = 0.06  # share of the floor that bodies cover, above which `settle` takes further rounds
+SETTLING_ROUNDS = 100  # most rounds of substeps of `settle`
 
 BLOCK = 64  # environments; measured in benchmarks/LOG.md
 
@@ -135,6 +140,7 @@ class _Bodies:
     box: Motion  # places and headings
     velocity: Motion  # of the boxes
     impulses: dict[str, Array]  # of each kind of contact
+    depth: Float[Array, "*envs"]  # m, deepest overlap at the start of the last substep
 
 
 def _run(
@@ -167,8 +173,12 @@ def _run(
     disc = Pose(position[:, 0], position[:, 1], jnp.cos(aim), jnp.sin(aim))
     box = Motion(box_position[:, 0], box_position[:, 1], box_heading)
     velocity = Motion(box_velocity[:, 0], box_velocity[:, 1], box_velocity[:, 2])
-    bodies = _Bodies(disc, box, velocity, no_impulses(disc.x, box.x))
-    bodies = jax.lax.fori_loop(0, num_substeps, substep, bodies)
+    bodies = _Bodies(disc, box, velocity, no_impulses(disc.x, box.x), depth=0 * side)
+    if has_inertia:
+        bodies = jax.lax.fori_loop(0, num_substeps, substep, bodies)
+    else:
+        is_crowded = _cover(disc.x, present) > CROWDED * side**2
+        bodies = _settle(solver, num_substeps, substep, is_crowded, bodies)
     disc, box, velocity = bodies.disc, bodies.box, bodies.velocity
     return (
         jnp.stack([disc.x, disc.y], 1),
@@ -177,6 +187,26 @@ def _run(
         box.turn,
         jnp.stack([velocity.x, velocity.y, velocity.turn], 1),
     )
+
+
+def _cover(disc: Float[Array, "discs *envs"], present: Float[Array, "boxes *envs"]) -> Float[Array, "*envs"]:
+    """Return the area in square meters that discs and present boxes cover."""
+    return math.pi * DISC_RADIUS**2 * len(disc) + BOX_SIDE**2 * present.sum(0)
+
+
+def _settle(
+    solver: Solver, num_substeps: int, substep: Callable, is_crowded: Bool[Array, "*envs"], bodies: _Bodies
+) -> _Bodies:
+    """Take one round of substeps, and further rounds in crowded environments with deep overlaps."""
+
+    def one_round(index: Array | int, bodies: _Bodies) -> _Bodies:
+        def advance(bodies: _Bodies) -> _Bodies:
+            return _where(is_unsettled, jax.lax.fori_loop(0, num_substeps, substep, bodies), bodies)
+
+        is_unsettled = (index == 0) | (is_crowded & (bodies.depth > solver.max_overlap))
+        return jax.lax.cond(_any_env(is_unsettled), advance, lambda bodies: bodies, bodies)
+
+    return jax.lax.fori_loop(0, SETTLING_ROUNDS, one_round, bodies)
 
 
 def _wrap(angle: Array) -> Array:
@@ -194,11 +224,12 @@ def _substep(
     counts = stage(lambda: {kind: contact.counts() for kind, contact in contacts.items()})
     masses = stage(lambda: {kind: contact.masses(solver, counts[kind]) for kind, contact in contacts.items()})
     contacts = {kind: contact.weighted(*masses[kind]) for kind, contact in contacts.items()}
+    depth = stage(lambda: _deepest([contact.depth() for contact in contacts.values()]))
     inertia = solver.drag * present if has_inertia else 0 * present
     motions = {"disc": drive, "box": jax.tree.map(lambda v: inertia * v, bodies.velocity)}
     motions, impulses = stage(partial(_warm_start, solver), contacts, motions, bodies.impulses)
     hold = partial(hold_discs, solver, side, bodies.disc)
-    motions, impulses = _solve(solver, stage, contacts, hold, motions, impulses)
+    motions, impulses = _solve(solver, stage, contacts, hold, depth, motions, impulses)
     shift = stage(partial(_part_boxes, solver), contacts, bodies.box)
 
     def advance(place: Array, velocity: Array) -> Array:
@@ -206,7 +237,7 @@ def _substep(
 
     x, y = advance(bodies.disc.x, motions["disc"].x), advance(bodies.disc.y, motions["disc"].y)
     moved = jax.tree.map(lambda a, v, s: advance(a, v) + s, bodies.box, motions["box"], shift)
-    return _Bodies(dataclasses.replace(bodies.disc, x=x, y=y), moved, motions["box"], impulses)
+    return _Bodies(dataclasses.replace(bodies.disc, x=x, y=y), moved, motions["box"], impulses, depth)
 
 
 def _warm_start(
@@ -224,10 +255,50 @@ def _solve(
     stage: Callable,
     contacts: dict[str, Contact],
     hold: Callable[[Motion], Motion],
+    depth: Float[Array, "*envs"],
     motions: Motions,
     impulses: dict[str, Array],
 ) -> tuple[Motions, dict[str, Array]]:
-    """Sweep over all kinds of contact, from the stiffest to the softest.
+    """Take one round of sweeps, and further rounds in environments where a deep overlap would still grow."""
+
+    def growing(motions: Motions) -> Float[Array, "*envs"]:
+        growth = [contact.growth(solver, motions) for contact in contacts.values()]
+        return 1.0 * (_deepest(growth) > GROWTH * solver.max_overlap)
+
+    def one_round(carry: tuple) -> tuple:
+        index, is_behind, motions, impulses = carry
+        motions, impulses = _sweep(solver, stage, contacts, hold, is_behind, motions, impulses)
+        is_behind = jax.lax.cond(is_any_deep, growing, lambda _: 0 * is_behind, motions)
+        return index + 1, is_behind, motions, impulses
+
+    def is_unfinished(carry: tuple) -> Bool[Array, ""]:
+        return (carry[0] < solver.rounds) & _any_env(carry[1] > 0)
+
+    is_any_deep = _any_env(depth > solver.max_overlap)
+    slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
+    start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
+    carry = (jnp.array(0), jnp.ones_like(depth) + 0 * depth, motions, start)
+    if stage.func is _apart:
+        *_, motions, impulses_and_slips = jax.lax.while_loop(is_unfinished, one_round, carry)
+    else:  # derivatives need a fixed number of rounds
+
+        def again(_: Array | int, carry: tuple) -> tuple:
+            return jax.lax.cond(is_unfinished(carry), one_round, lambda carry: carry, carry)
+
+        *_, motions, impulses_and_slips = jax.lax.fori_loop(0, solver.rounds, again, carry)
+    return motions, {kind: impulse for kind, (impulse, _) in impulses_and_slips.items()}
+
+
+def _sweep(
+    solver: Solver,
+    stage: Callable,
+    contacts: dict[str, Contact],
+    hold: Callable[[Motion], Motion],
+    is_behind: Float[Array, "*envs"],
+    motions: Motions,
+    impulses: dict[str, tuple],
+) -> tuple[Motions, dict[str, tuple]]:
+    """Sweep over all kinds of contact, from the stiffest to the softest, where `is_behind` is 1; elsewhere it is 0.
 
     Contacts between discs are solved twice per sweep, and walls stop discs after each time, because piles of discs
     separate most slowly.
@@ -235,21 +306,19 @@ def _solve(
 
     def sweep(index: Array | int, carry: tuple) -> tuple:
         motions, before = carry
-        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
+        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0) * is_behind
         after = dict(before)
         for kind in (*contacts, "disc_disc"):
             contact, last = contacts[kind], after[kind]
             moved = {body: motions[body] for body in contact.bodies}
-            after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
+            after[kind] = stage(partial(contact.answer, relaxation, is_behind), moved, *last)
             motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
             if kind == "disc_disc":
-                motions = motions | {"disc": hold(motions["disc"])}
+                held = hold(motions["disc"])
+                motions = motions | {"disc": _where(is_behind > 0, held, motions["disc"])}
         return motions, after
 
-    slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
-    start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
-    motions, impulses = jax.lax.fori_loop(0, solver.iterations, sweep, (motions, start))
-    return motions, {kind: impulse for kind, (impulse, _) in impulses.items()}
+    return jax.lax.fori_loop(0, solver.iterations, sweep, (motions, impulses))
 
 
 def _correct(solver: Solver, contact: Contact, motions: Motions, after: tuple, before: tuple) -> Motions:
@@ -265,6 +334,26 @@ def _part_boxes(solver: Solver, contacts: dict[str, Contact], box: Motion) -> Mo
         overlap = jnp.maximum(-contact.gap, 0)
         shift = contact.push(solver, shift, solver.box_recovery * overlap * contact.normal.mass)
     return shift["box"]
+
+
+def _deepest(depths: list[Float[Array, "*envs"]]) -> Float[Array, "*envs"]:
+    return functools.reduce(jnp.maximum, depths)
+
+
+def _where(is_chosen: Bool[Array, "*envs"], new: Any, old: Any) -> Any:
+    """Select arrays [..., *envs] by environment."""
+    return jax.tree.map(lambda a, b: jnp.where(jnp.broadcast_to(is_chosen, a.shape), a, b), new, old)
+
+
+@jax.custom_batching.custom_vmap
+def _any_env(is_chosen: Bool[Array, "*envs"]) -> Bool[Array, ""]:
+    """Return whether any environment is chosen, as a scalar also under `vmap`, where `cond` would run both branches."""
+    return jnp.any(is_chosen)
+
+
+@_any_env.def_vmap
+def _any_env_of_all(_: int, is_batched: list, is_chosen: Array) -> tuple[Array, bool]:
+    return jnp.any(is_chosen), False
 
 
 def _together(_: Array | int, function: Callable, *args: Any) -> Any:

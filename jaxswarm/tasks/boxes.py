@@ -229,7 +229,7 @@ class Clustering:
         obs = self.arena.perceive(view, agent)
         boxes = obs.groups["boxes"]
         if self.cluster_identity == "one-hot":
-            identity = jax.nn.one_hot(jnp.array(self.cluster), self.num_clusters)
+            identity = jnp.where(boxes.mask[:, None], jax.nn.one_hot(jnp.array(self.cluster), self.num_clusters), 0)
             boxes = Entities(jnp.concatenate([boxes.features, identity], -1), boxes.mask)
             return Observation(obs.own, obs.groups | {"boxes": boxes})
         groups = {name: Entities(boxes.features[part], boxes.mask[part]) for name, part in self._box_slices.items()}
