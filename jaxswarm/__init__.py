@@ -6,6 +6,7 @@ from etils import epy
 
 with epy.lazy_api_imports(globals()):  # the command line answers before JAX is there
     from jaxswarm.aggregators import AGGREGATORS
+    from jaxswarm.host.divergence import replay_update
     from jaxswarm.host.fit import fit
     from jaxswarm.host.trained import load
     from jaxswarm.learners import LEARNERS
@@ -31,6 +32,7 @@ __all__ = [
     "init",
     "load",
     "make",
+    "replay_update",
     "train",
 ]
 

@@ -160,7 +160,7 @@ def evaluate(experiment: Experiment, train_state: TrainState) -> Metrics:
 def _evaluate_and_update(experiment: Experiment, state: TrainState) -> tuple[TrainState, Metrics]:
     is_due = state.update % experiment.eval_every == 0
     eval_metrics = _evaluate_if(is_due, experiment, state)
-    rollout_key, learner_key = jax.random.split(jax.random.fold_in(_update_key(state), 1))
+    rollout_key, learner_key = update_keys(state)
     envs, trajectory, train_metrics = rollout.collect(
         rollout_key,
         experiment.task,
@@ -202,6 +202,12 @@ def _evaluate_if(is_due: Bool[Array, ""], experiment: Experiment, state: TrainSt
         return jnp.zeros((), bool), evaluate(experiment, state)
 
     return jax.lax.while_loop(lambda carry: carry[0], body, (is_due, skipped))[1]
+
+
+def update_keys(state: TrainState) -> tuple[Key, Key]:
+    """Return the keys of the rollout and of the learner in the next update."""
+    rollout_key, learner_key = jax.random.split(jax.random.fold_in(_update_key(state), 1))
+    return rollout_key, learner_key
 
 
 def _update_key(state: TrainState) -> Key:

@@ -24,7 +24,7 @@ OVERRIDES = (
     "network.encoder=[4] network.decoder=[4]"
 )
 EXPERIMENT = config.build(config.compose(OVERRIDES.split()))
-DIVERGING = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
+DIVERGING = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e10))
 OPTIONS = {"progress": False, "checkpoint_seconds": 0.0}
 
 

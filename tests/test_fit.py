@@ -309,7 +309,7 @@ def test_another_run_is_never_overwritten(undisturbed):
 def test_numbers_that_are_not_finite_stop_the_run_and_leave_the_last_good_checkpoint(tmp_path):
     run_dir = tmp_path / "run"
     fit(EXPERIMENT, 3, run_dir=run_dir, **OPTIONS)
-    diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e30))
+    diverging = EXPERIMENT.replace(learner=EXPERIMENT.learner.replace(learning_rate=1e10))
     with pytest.raises(DivergedError, match=r"is (nan|inf|not finite) at update \d"):
         fit(diverging, NUM_UPDATES, run_dir=run_dir, resume=True, force=True, **OPTIONS)
     restored = checkpoint.restore(run_dir / "checkpoints", ensemble.abstract_state(EXPERIMENT))

@@ -36,7 +36,7 @@ LEVELS = [
     {"analysis.training_curve", "analysis.run_folders", "render"},
     {"analysis"},
     {"host.run"},
-    {"host.resume", "host.trained", "host.signals"},
+    {"host.divergence", "host.resume", "host.trained", "host.signals"},
     {"host.recorder"},
     {"host.batch_recorder"},
     {"host.fit"},

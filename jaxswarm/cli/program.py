@@ -66,16 +66,19 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
 @contextlib.contextmanager
 def _isolated() -> Iterator[None]:
     """Keep settings inherited from a notebook or a terminal from ending a program, and restore them after it."""
-    inherited = {name: os.environ.pop(name, None) for name in ("MPLBACKEND", "JAX_ENABLE_X64")}
-    os.environ["MPLBACKEND"] = "agg"  # without JAX_ENABLE_X64, programs compute in single precision
+    inherited = {name: os.environ.get(name) for name in ("MPLBACKEND", "JAX_ENABLE_X64", "XLA_FLAGS")}
+    os.environ["MPLBACKEND"] = "agg"
+    os.environ.pop("JAX_ENABLE_X64", None)  # programs compute in single precision
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):  # not a stream of the system
             stream.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:
-        os.environ.pop("MPLBACKEND", None)
-        os.environ.update({name: value for name, value in inherited.items() if value is not None})
+        for name, value in inherited.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
 
 
 def _print_version() -> int:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxswarm.files import Row
-from jaxswarm.host import ensemble
+from jaxswarm.host import divergence, ensemble
 from jaxswarm.host.ensemble import RunBatch
 from jaxswarm.host.progress import Progress
 from jaxswarm.host.recorder import Recorder
@@ -126,7 +126,6 @@ class BatchRecorder:
                 recorder.save()
         if chunk.is_saved:
             self._last_save = time.monotonic()
-        self._report_diverged()
         self._measure(chunk)
         returns = [x for recorder in self.recorders if (x := recorder.latest_return()) is not None]
         evaluation = (returns[0][0], float(np.median([x for _, x in returns]))) if returns else None
@@ -143,7 +142,7 @@ class BatchRecorder:
         for recorder, part in self._parts():
             own = None if evaluation is None else {name: x[part] for name, x in evaluation.items()}
             recorder.finish(update, self._wall_seconds, _slice(states, part), own)
-        self._report_diverged()
+        self.report_diverged(states)
 
     def _measure(self, chunk: Chunk) -> None:
         """Update the clock, and the speed from all chunks but the first, which includes compilation."""
@@ -158,16 +157,40 @@ class BatchRecorder:
         for index, recorder in enumerate(self.recorders):
             yield recorder, slice(index * size, (index + 1) * size)
 
-    def _report_diverged(self) -> None:
-        """Warn about seeds that have diverged since the last call; raise a `DivergedError` if no seed is left."""
+    def report_diverged(self, states: TrainState) -> None:
+        """Save the frozen states of seeds that have diverged since the last call, and warn about them.
+
+        `states` are those after the recorded chunk, or after a later one. Raises a `DivergedError` if no seed is left.
+        """
         diverged = [(recorder, seed) for recorder in self.recorders for seed in recorder.diverged]
+        new, self._num_reported = diverged[self._num_reported :], len(diverged)
+        if not new:
+            return
+        states = ensemble.fetch(self.batch, states)
+        for recorder, part in self._parts():
+            for seed in [seed for owner, seed in new if owner is recorder]:
+                start = part.start + recorder.run.seeds.index(seed)
+                self.progress.warn(_describe_divergence(recorder, seed, _slice(states, slice(start, start + 1))))
         if len(diverged) == self.batch.num_runs:
             reason = diverged[-1][0].reason[diverged[-1][1]]
             raise DivergedError(f"{reason}; training stopped", [recorder.rows for recorder in self.recorders])
-        for recorder, seed in diverged[self._num_reported :]:
-            where = f" of {recorder.run.run_dir}" if recorder.run.run_dir else ""
-            self.progress.warn(f"seed {seed}{where} diverged and is frozen: {recorder.reason[seed]}")
-        self._num_reported = len(diverged)
+
+
+def _describe_divergence(recorder: Recorder, seed: int, state: TrainState) -> str:
+    """Save the frozen state, leaves [1, ...], and return one line about what diverged and how to replay it."""
+    run = recorder.run
+    if run.run_dir is None:
+        return f"seed {seed} diverged and is frozen: {recorder.reason[seed]}"
+    folder = divergence.save(run, seed, state)
+    try:
+        first = divergence.replay_update(folder, run.experiment).first
+    except Exception as error:  # training of the other seeds continues
+        first = f"unknown ({type(error).__name__})"
+    replay = f'python -c "import jaxswarm; print(jaxswarm.replay_update({str(folder)!r}).first)"'
+    return (
+        f"seed {seed} of {run.run_dir} diverged and is frozen: {recorder.reason[seed]}; "
+        f"non-finite first: {first}; replay that update with: {replay}"
+    )
 
 
 def _slice(states: Any, part: slice) -> Any:

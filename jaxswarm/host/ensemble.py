@@ -28,6 +28,10 @@ from jaxswarm.types import Metrics
 
 RUNS_AXIS = "runs"
 CPU_WIDTH = 1  # vectorized runs on a CPU, whose cache holds the activations of one; measured in benchmarks/LOG.md
+COLLECTIVE_LIMITS = (
+    "xla_cpu_collective_call_terminate_timeout_seconds",
+    "xla_cpu_collective_call_warn_stuck_timeout_seconds",
+)
 MEMORY_SHARE = 0.9  # of the free memory that a program may use
 LESS_MEMORY = "reduce num_envs, num_steps, num_seeds, num_eval_envs or learner.batch_size"
 
@@ -52,13 +56,22 @@ def use_cores(num_runs: int) -> None:
     """Make each CPU core a device that trains its own runs; must be called before JAX uses any device.
 
     Two cores then train two runs in half the time of training them in sequence (benchmarks/LOG.md). This does nothing
-    if devices are already in use, or if XLA_FLAGS or JAX_COORDINATOR_ADDRESS determine the devices.
+    if devices are already in use, or if XLA_FLAGS or JAX_COORDINATOR_ADDRESS determine the devices. It also lets XLA
+    wait for a core of a busy machine as long as necessary; otherwise XLA aborts the process after a minute.
     """
+    _wait_for_cores()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     is_decided = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if not is_decided and "JAX_COORDINATOR_ADDRESS" not in os.environ:
         with contextlib.suppress(RuntimeError):  # devices are already in use
             jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if num_runs % n == 0))
+
+
+def _wait_for_cores() -> None:
+    """Set XLA's time limits for collective operations to ten days, unless XLA_FLAGS determine them."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    own = [f"--{name}={10 * 24 * 3600}" for name in COLLECTIVE_LIMITS if name not in flags]
+    os.environ["XLA_FLAGS"] = " ".join([flags, *own]).strip()
 
 
 def make_batch(experiments: Sequence[Experiment], num_seeds: int) -> RunBatch:

@@ -192,6 +192,7 @@ def _train(states: TrainState, num_updates: int, recorder: BatchRecorder, stop: 
         states, metrics = program(recorder.batch.experiments, states, np.int32(length))
         if in_flight:
             recorder.record(in_flight)
+            recorder.report_diverged(states)
         else:
             recorder.progress.begin()
             recorder.open()
@@ -199,6 +200,7 @@ def _train(states: TrainState, num_updates: int, recorder: BatchRecorder, stop: 
         update += length
     if in_flight:
         recorder.record(in_flight)
+        recorder.report_diverged(states)
     recorder.finish(update, states, is_complete=update == num_updates)
     return states
 
