@@ -301,6 +301,8 @@ def test_each_task_and_each_reward_has_a_panel(tmp_path, capsys):
     assert list(dict.fromkeys(row["panel"] for row in read("x.csv"))) == panels
     assert all(title in text_of("x.svg") for title in ["All tasks", *panels])
     assert f"{panels[-1]}; rendezvous, mean, ppo: 1 seed" in capsys.readouterr().out
+    assert plot.main(["runs", "out=x.svg", "color=torus", "labels=num_agents"]) == 0
+    assert {"torus=true", "torus=false"} <= set(texts_of("x.svg"))
     assert plot.main(["runs", "reference=" + str(tmp_path / "x.csv")]) == 2
 
 
@@ -343,6 +345,7 @@ def test_lines_are_colored_by_a_setting(tmp_path):
     texts = texts_of("x.svg")
     assert all(texts.count(f"learning_rate={x}") == 1 for x in ("0.001", "0.002", "0.003", "0.004", "0.005"))
     assert not any("num_agents" in text for text in texts)
+    assert [text for text in texts if "learning_rate" in text] == sorted(x for x in texts if "learning_rate" in x)
 
 
 @pytest.mark.parametrize("size", ["", "size=3.3", "size=3.3x2"])

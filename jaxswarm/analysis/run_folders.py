@@ -72,8 +72,8 @@ def fields(config: configs.Config) -> Fields:
 def group(folders: Sequence[RunFolder], keys: Sequence[str] = ()) -> dict[str, list[RunFolder]]:
     """Group folders whose compared settings are equal.
 
-    The keys of the result are labels: the settings that differ between groups, or those in `keys`. Raises a
-    `ConfigError` if `keys` give two groups the same label.
+    The keys of the result are labels: the settings that differ between groups, or those of the full
+    keys in `keys`. Raises a `ConfigError` if `keys` give two groups the same label.
     """
     by_settings = defaultdict(list)
     for folder in folders:
@@ -81,8 +81,7 @@ def group(folders: Sequence[RunFolder], keys: Sequence[str] = ()) -> dict[str, l
     groups = list(by_settings.values())
     all_fields = [members[0].config for members in groups]
     if keys:
-        full_keys = [resolve("labels", key, all_fields) for key in keys]
-        texts = [settings(key, all_fields) for key in full_keys]
+        texts = [settings(key, all_fields) for key in keys]
         labels = [", ".join(parts) for parts in zip(*texts, strict=True)]
         twice = next((text for text in labels if labels.count(text) > 1), None)
         if twice is not None:

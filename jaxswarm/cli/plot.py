@@ -44,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     files = filter(None, options.reference.split(","))
     references = [series for file in files for series in _references(Path(file), options)]
     folders = [runs.read(path) for path in runs.find(paths)]
-    panels = _panels(folders, options)
+    panels = _panels(folders, _with_full_keys(options, folders))
     if references and len(panels) > 1:
         raise ConfigError(f"reference: must be used with runs of one task, got {len(panels)} panels")
     kind = KINDS[options.kind]
@@ -112,10 +112,21 @@ def _panel(folders: Sequence[RunFolder], subtitle: str, options: Options, is_alo
     found = {label: runs.seeds(members, options.x, column, _warn) for label, members in groups.items()}
     size = int(options.smooth)
     smooth = {label: [curves.trailing_mean(x, size) for x in seeds] for label, seeds in found.items() if seeds}
+    colors = _colors(groups, options)
+    smooth = {label: smooth[label] for label in colors or groups if label in smooth}
     title = ", ".join(filter(None, [runs.common_name([folder.config for folder in folders]), subtitle]))
     if is_alone:
         title = options.title or (title if len(groups) > 1 else "")
-    return Panel(title, column, y_label, smooth, _colors(groups, options))
+    return Panel(title, column, y_label, smooth, colors)
+
+
+def _with_full_keys(options: Options, folders: Sequence[RunFolder]) -> Options:
+    """Return the options with the full keys of settings; raise a `ConfigError` for a key that no run has."""
+    all_fields = [folder.config for folder in folders]
+    keys = [] if options.labels == "run" else list(filter(None, options.labels.split(",")))
+    labels = ",".join(runs.resolve("labels", key, all_fields) for key in keys) or options.labels
+    color = runs.resolve("color", options.color, all_fields) if options.color else ""
+    return dataclasses.replace(options, labels=labels, color=color)
 
 
 def _column(folders: Sequence[RunFolder], options: Options) -> tuple[str, str]:
@@ -140,8 +151,8 @@ def _column(folders: Sequence[RunFolder], options: Options) -> tuple[str, str]:
 def _colors(groups: Mapping[str, Sequence[RunFolder]], options: Options) -> dict[str, str]:
     if not options.color:
         return {}
-    all_fields = [members[0].config for members in groups.values()]
-    return dict(zip(groups, runs.settings(runs.resolve("color", options.color, all_fields), all_fields), strict=True))
+    texts = runs.settings(options.color, [members[0].config for members in groups.values()])
+    return dict(sorted(zip(groups, texts, strict=True), key=lambda pair: runs.by_number(pair[1])))
 
 
 def _curve(panel: Panel, options: Options) -> Plot:
