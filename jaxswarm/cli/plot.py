@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -125,7 +126,7 @@ def _parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
     options, overrides = split(arguments, names)
     for word in overrides:
         name, equals, _ = word.partition("=")
-        if equals and not Path(word).exists():
+        if equals and not os.path.exists(word):
             near = schema.nearest(name, names)
             raise ConfigError(f"unknown key {name!r}{near}; valid keys: {', '.join(names)}")
     if not overrides:

@@ -48,7 +48,8 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the final flush of Python
             return 141
         except OSError as error:
-            reason = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error
+            path = schema.shown(str(error.filename)).strip("'")
+            reason = f"{path}: {error.strerror}" if error.filename and error.strerror else error
             print(f"error: {reason}", file=sys.stderr)
             return 2 if error.errno in UNUSABLE_PATH else 1
         except RuntimeError as error:
@@ -103,7 +104,7 @@ def split(arguments: Sequence[str], names: Sequence[str]) -> tuple[dict[str, str
 
 def split_paths(arguments: Sequence[str], names: Sequence[str]) -> tuple[list[Path], dict[str, str], list[str]]:
     """Split arguments into paths (without "=", or existing), the program's own options, and overrides."""
-    paths = [word for word in arguments if "=" not in word or Path(word).exists()]
+    paths = [word for word in arguments if "=" not in word or os.path.exists(word)]  # false for impossible names
     return [Path(word) for word in paths], *split([word for word in arguments if word not in paths], names)
 
 

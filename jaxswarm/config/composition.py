@@ -46,8 +46,9 @@ def load(path: Path) -> Config:
     """
     config = read_yaml(path)
     imports = config.get("imports")
-    is_list = isinstance(imports, list) and all(isinstance(one, str) for one in imports)
-    plugins.run(plugins.locate(imports, path.parent) if is_list else imports or [])
+    if isinstance(imports, list) and all(isinstance(one, str) for one in imports):
+        imports = plugins.locate(imports, path.parent)
+    plugins.run(imports or [])
     return validate(_translate(config, path))
 
 
