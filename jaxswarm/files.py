@@ -15,6 +15,7 @@ import numpy as np
 RETURN = "eval/return"
 Row = dict[str, Any]  # row of metrics.csv by column; empty cells are NaN
 
+MAX_CELL = 2**53  # magnitude of integers, which floats represent exactly
 INTEGERS = ("update", "agent_steps", "seed")
 LEADING = ("update", "agent_steps", "wall_seconds", "seed", "eval/return", "eval/return_std")
 
@@ -141,5 +142,8 @@ def _cell(value: Any) -> str:
 
 def _number(name: str, cell: str) -> float | int:
     if name in INTEGERS:
-        return int(cell)
+        number = int(cell)
+        if abs(number) > MAX_CELL:
+            raise ValueError(f"{name}: must be an integer of at most {MAX_CELL} in magnitude")
+        return number
     return float(cell) if cell else math.nan

@@ -1,5 +1,6 @@
 import csv
 import math
+import shutil
 import xml.etree.ElementTree
 
 import numpy as np
@@ -256,3 +257,24 @@ def test_many_series_share_no_color_and_marker():
         patch.setattr(plots, "_draw_line", lambda *arguments: (styles.append(arguments[-1]), original(*arguments)))
         plots.draw(plot.Path("many.svg"), many)
     assert len({(style["color"], style["marker"]) for style in styles}) == 20
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "message"),
+    [
+        ("eval/return", "1e308", "no finite eval/return"),
+        ("eval/return", "-inf", "no finite eval/return"),
+        ("agent_steps", "9" * 400, "agent_steps: must be an integer of at most 9007199254740992"),
+        ("agent_steps", "inf", "cannot read"),
+    ],
+)
+def test_infinite_cells_are_refused(column, cell, message, runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = shutil.copytree(next(path.parent for path in sorted(runs.rglob("config.yaml"))), tmp_path / "run")
+    header, *lines = (folder / "metrics.csv").read_text().splitlines()
+    index = header.split(",").index(column)
+    lines = [",".join([*(cells := line.split(","))[:index], cell, *cells[index + 1 :]]) for line in lines]
+    (folder / "metrics.csv").write_text("\n".join([header, *lines]) + "\n")
+    assert plot.main(["run"]) == 2
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
