@@ -19,6 +19,7 @@ RETURN = "eval/return"
 SECONDS_FOR_SPACE = 60.0  # how long training waits for space on a full disk
 Row = dict[str, Any]  # row of metrics.csv by column; empty cells are NaN
 
+MAX_CELL = 2**53  # magnitude of integers, which floats represent exactly
 INTEGERS = ("update", "agent_steps", "env_steps", "seed")
 LEADING = ("update", "agent_steps", "env_steps", "wall_seconds", "seed", "eval/return", "eval/return_std")
 
@@ -176,5 +177,8 @@ def _cell(value: Any) -> str:
 
 def _number(name: str, cell: str) -> float | int:
     if name in INTEGERS:
-        return int(cell)
+        number = int(cell)
+        if abs(number) > MAX_CELL:
+            raise ValueError(f"{name}: must be an integer of at most {MAX_CELL} in magnitude")
+        return number
     return float(cell) if cell else math.nan

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 
 import jaxswarm
 from jaxswarm import config as configs
@@ -62,6 +63,24 @@ def test_more_updates_than_a_counter_holds_are_refused():
     with pytest.raises(ConfigError, match=r"total_agent_steps: must be at most 51539607528, .*got 9999999999999"):
         run.length(24)
     assert run.length(81_920) == 122_070_313
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("learner: {name: {a: 1}}", "learner.name: must be one of ppo, trl, got {'a': 1}"),
+        ("task: {name: [1]}", "task.name: must be one of rendezvous, "),
+        ("imports: [1, 2]", "imports[0]: must be text, got 1"),
+        ("num_envs: 2147483648", "num_envs: must be an integer of at most 2147483647"),
+        ("network: 3", "network: must be a mapping of fields, got 3"),
+    ],
+)
+def test_a_stored_config_is_refused_alike(text, message, tmp_path):
+    config, change = configs.compose(), yaml.safe_load(text)
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config | change))
+    with pytest.raises(ConfigError) as caught:
+        configs.load(tmp_path / "config.yaml")
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(

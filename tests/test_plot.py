@@ -1,5 +1,6 @@
 import csv
 import math
+import shutil
 import xml.etree.ElementTree
 
 import numpy as np
@@ -372,3 +373,24 @@ def test_a_legend_of_many_labels_is_not_taller_than_the_plot(size, length):
 def test_a_wrong_size_or_key_is_an_error(runs, capsys, option):
     assert plot.main([str(runs), option]) == 2
     assert f"{option.partition('=')[0]}: must be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "message"),
+    [
+        ("eval/return", "1e308", "no finite eval/return"),
+        ("eval/return", "-inf", "no finite eval/return"),
+        ("agent_steps", "9" * 400, "agent_steps: must be an integer of at most 9007199254740992"),
+        ("agent_steps", "inf", "cannot read"),
+    ],
+)
+def test_infinite_cells_are_refused(column, cell, message, runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = shutil.copytree(next(path.parent for path in sorted(runs.rglob("config.yaml"))), tmp_path / "run")
+    header, *lines = (folder / "metrics.csv").read_text().splitlines()
+    index = header.split(",").index(column)
+    lines = [",".join([*(cells := line.split(","))[:index], cell, *cells[index + 1 :]]) for line in lines]
+    (folder / "metrics.csv").write_text("\n".join([header, *lines]) + "\n")
+    assert plot.main(["run"]) == 2
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

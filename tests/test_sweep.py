@@ -307,6 +307,8 @@ def test_a_damaged_plan_is_refused(text, tmp_path, capsys):
         (["num_updates=1..3:3"], "num_updates: must have one value in a sweep, got 1,2,3"),
         (["num_envs=1..9:1000000"], "with 2 <= count <= 1000"),
         (["task.side=1..1e400:3"], "task.side: must be low..high:count"),
+        (["sweep_dir=[]"], "must not contain [, ]"),
+        (["sweep_dir=[]", "search=thesis"], "must not contain [, ]"),
         (["num_envs=2,4", "init_from=nowhere"], "init_from: must be a run folder"),
         (["num_envs=glob(*)"], "override: must be key=value"),
         (["num_agents=2,100000"], "task.num_agents: must be small enough for the memory, got 100000"),

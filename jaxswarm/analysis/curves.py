@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 MAX_POINTS = 1000  # per line; longer grids are thinned out evenly
 NUM_RESAMPLES = 2000  # bootstrap resamples per interval
 CONFIDENCE = 0.95
+MAX_VALUE = float(np.finfo(np.float32).max)  # metrics are in single precision, so larger cells count as infinite
 COLUMNS = ("series", "agent_steps", "median", "q25", "q75")  # of CSV files with reference lines
 
 Values = Float[np.ndarray, "seeds points"]
@@ -69,7 +70,7 @@ def from_rows(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> tuple[dict[i
     curves, num_left_out = {}, 0
     for seed in sorted(points_by_seed):
         points = np.array(points_by_seed[seed], float)
-        is_finite = np.all(np.isfinite(points), axis=1)
+        is_finite = np.all(np.abs(points) <= MAX_VALUE, axis=1)
         num_left_out += np.count_nonzero(~is_finite[0 if y.startswith("eval/") else 1 :])
         if is_finite.any():
             distinct_x, last = np.unique(points[is_finite, 0][::-1], return_index=True)

@@ -1,6 +1,7 @@
 """Options of the program `jaxswarm-plot`."""
 
 import dataclasses
+import os
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -126,7 +127,7 @@ def parse(arguments: Sequence[str]) -> tuple[Options, list[Path]]:
     options, overrides = split(arguments, names)
     for word in overrides:
         name, equals, _ = word.partition("=")
-        if equals and not Path(word).exists():
+        if equals and not os.path.exists(word):
             near = schema.nearest(name, names)
             raise ConfigError(f"unknown key {name!r}{near}; valid keys: {', '.join(names)}")
     if not overrides:

@@ -49,7 +49,8 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the final flush of Python
             return 141
         except OSError as error:
-            reason = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error
+            path = schema.shown(str(error.filename)).strip("'")
+            reason = f"{path}: {error.strerror}" if error.filename and error.strerror else error
             print(f"error: {reason}", file=sys.stderr)
             return 2 if error.errno in UNUSABLE_PATH else 1
         except RuntimeError as error:
@@ -110,7 +111,7 @@ def split_paths(arguments: Sequence[str], names: Sequence[str]) -> tuple[list[Pa
 
     `imports=...` runs these files in place of the imports that the run folders store.
     """
-    paths = [word for word in arguments if "=" not in word or Path(word).exists()]
+    paths = [word for word in arguments if "=" not in word or os.path.exists(word)]  # false for impossible names
     options, overrides = split([word for word in arguments if word not in paths], names)
     return [Path(word) for word in paths], options, substitute_imports(overrides)
 

@@ -83,6 +83,7 @@ def _run(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> 
 
 def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
     from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
+    from jaxswarm.host.run import check_folder  # noqa: PLC0415
     from jaxswarm.studies import grid  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
 
@@ -94,6 +95,8 @@ def _sweep(sweep_dir: Path, overrides: Sequence[str]) -> int:
         num_runs = (1 + len(others)) * first.settings.num_seeds
         estimate.check_training(first.experiment, num_runs, first.num_updates, warn)
         trained.require_warm_start(first.settings)
+        for run in (first, *others):
+            check_folder(run, resume=True)
     _save(sweep_dir, {}, overrides)
     print(f"{_count(runs, 'run')} in {_count(programs, 'program')}\nfolder: {sweep_dir}", flush=True)
     rows = {}
@@ -123,7 +126,7 @@ def _report(sweep_dir: Path, summary: "Summary") -> None:
 
 def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) -> int:
     from jaxswarm.host import ensemble, estimate, signals, trained  # noqa: PLC0415
-    from jaxswarm.host.run import Run  # noqa: PLC0415
+    from jaxswarm.host.run import Run, check_folder  # noqa: PLC0415
     from jaxswarm.studies import search  # noqa: PLC0415
     from jaxswarm.studies.execution import train  # noqa: PLC0415
 
@@ -133,9 +136,10 @@ def _search(sweep_dir: Path, options: dict[str, str], overrides: Sequence[str]) 
     num_trials = parse_integer("trials", options.get("trials", 20), 1)
     use_compile_cache()
     ensemble.use_cores(config["num_seeds"])
-    run_settings = configs.run_settings(config)
-    estimate.check_training(configs.build(config), run_settings.num_seeds)
-    trained.require_warm_start(run_settings)
+    template = Run.from_config(config, sweep_dir / "trial")
+    check_folder(template, resume=True)
+    estimate.check_training(template.experiment, template.settings.num_seeds)
+    trained.require_warm_start(template.settings)
     study = search.open_study(options["storage"]) if "storage" in options else None
     _save(sweep_dir, options, overrides)
     study = search.open_study(str(sweep_dir / "journal.log")) if study is None else study

@@ -5,7 +5,7 @@ import inspect
 import math
 import types
 import typing
-from typing import Any
+from typing import Any, TypeGuard
 
 from jaxswarm.limits import LARGER_INTEGERS, MAX_INTEGER, MAX_LENGTH, MAX_NUMBER
 
@@ -67,7 +67,7 @@ def check(value: Any, annotation: Any, name: str) -> Any:
     raise ConfigError(f"{name}: must be {_describe(annotation)}, got {shown(value)}{_spelling(value, annotation)}")
 
 
-def is_number(value: Any) -> typing.TypeGuard[int | float]:
+def is_number(value: Any) -> TypeGuard[int | float]:
     """Return whether a value is an integer or a float; booleans are neither."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
