@@ -284,6 +284,25 @@ def test_absent_boxes_are_neither_seen_nor_rewarded(task):
     np.testing.assert_array_equal(jnp.concatenate(masks, 1)[0], state.box_present)
 
 
+@pytest.mark.parametrize(
+    "task",
+    [
+        Assembly(num_agents=3, active_boxes=(1, 3)),
+        Clustering(num_agents=3, active_boxes=(1, 3)),
+        Clustering(num_agents=3, active_boxes=(1, 3), cluster_identity="one-hot"),
+    ],
+    ids=["assembly", "groups", "one-hot"],
+)
+def test_features_of_absent_boxes_are_zero(task):
+    state, _ = states_with_one_absent(task)
+    groups = [group for name, group in observe(task, state).groups.items() if "boxes" in name]
+    num_absent = sum((~np.asarray(group.mask)).sum() for group in groups)
+    assert num_absent == task.num_agents
+    for group in groups:
+        assert not np.asarray(group.features)[~np.asarray(group.mask)].any()
+        assert np.asarray(group.features)[np.asarray(group.mask)].any(-1).all()
+
+
 @functools.cache
 def starts():
     return jax.jit(jax.vmap(Assembly().reset))(jax.random.split(KEY, 2000))

@@ -293,14 +293,13 @@ class Contact:
     def answer(
         self,
         relaxation: Float[Array, "*envs"],
-        slip_relaxation: Float[Array, "*envs"],
         motions: Motions,
         impulse: Array,
         slip: Array | None,
     ) -> tuple[Array, Array | None]:
         """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`.
 
-        With relaxations of 0 they stay the previous ones.
+        With a relaxation of 0 they stay the previous ones.
         """
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
         impulse = jnp.maximum(impulse - relaxation[None, None, None] * error, 0)
@@ -308,7 +307,7 @@ class Contact:
             return impulse, None
         limit = self.friction * total(impulse, 0)[None]
         error = self.tangent.mass * self.tangent.velocity(motions)
-        return impulse, jnp.clip(slip - slip_relaxation[None, None, None] * error, -limit, limit)
+        return impulse, jnp.clip(slip - jnp.sign(relaxation)[None, None, None] * error, -limit, limit)
 
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
         """Return the motions after these impulses."""

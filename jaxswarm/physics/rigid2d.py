@@ -259,33 +259,39 @@ def _solve(
     motions: Motions,
     impulses: dict[str, Array],
 ) -> tuple[Motions, dict[str, Array]]:
-    """Take one round of sweeps, and further rounds in environments where a deep overlap would still grow."""
+    """Take one round of sweeps, and further rounds in environments where a deep overlap would still grow.
+
+    `is_behind` is 1 in environments that take the round, and 0 elsewhere.
+    """
 
     def growing(motions: Motions) -> Float[Array, "*envs"]:
         growth = [contact.growth(solver, motions) for contact in contacts.values()]
         return 1.0 * (_deepest(growth) > GROWTH * solver.max_overlap)
 
-    def one_round(carry: tuple) -> tuple:
+    def advance(carry: tuple) -> tuple:
         index, is_behind, motions, impulses = carry
-        motions, impulses = _sweep(solver, stage, contacts, hold, is_behind, motions, impulses)
-        is_behind = jax.lax.cond(is_any_deep, growing, lambda _: 0 * is_behind, motions)
+        is_last = (index + 1) % solver.iterations == 0
+        relaxation = jnp.where(is_last, 1.0, solver.relaxation) * is_behind
+        motions, impulses = _sweep(solver, stage, contacts, hold, relaxation, motions, impulses)
+        behind = jnp.where(is_last, 0, is_behind)
+        is_behind = jax.lax.cond(is_last & is_any_deep, growing, lambda _: behind, motions)
         return index + 1, is_behind, motions, impulses
 
     def is_unfinished(carry: tuple) -> Bool[Array, ""]:
-        return (carry[0] < solver.rounds) & _any_env(carry[1] > 0)
+        return (carry[0] < most) & _any_env(carry[1] > 0)
 
-    is_any_deep = _any_env(depth > solver.max_overlap)
+    most, is_any_deep = solver.rounds * solver.iterations, _any_env(depth > solver.max_overlap)
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
     start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
-    carry = (jnp.array(0), jnp.ones_like(depth) + 0 * depth, motions, start)
+    carry = (jnp.array(0), 1 + 0 * depth, motions, start)
     if stage.func is _apart:
-        *_, motions, impulses_and_slips = jax.lax.while_loop(is_unfinished, one_round, carry)
-    else:  # derivatives need a fixed number of rounds
+        *_, motions, impulses_and_slips = jax.lax.while_loop(is_unfinished, advance, carry)
+    else:  # derivatives need a fixed number of sweeps
 
-        def again(_: Array | int, carry: tuple) -> tuple:
-            return jax.lax.cond(is_unfinished(carry), one_round, lambda carry: carry, carry)
+        def attempt(_: Array | int, carry: tuple) -> tuple:
+            return jax.lax.cond(is_unfinished(carry), advance, lambda carry: carry, carry)
 
-        *_, motions, impulses_and_slips = jax.lax.fori_loop(0, solver.rounds, again, carry)
+        *_, motions, impulses_and_slips = jax.lax.fori_loop(0, most, attempt, carry)
     return motions, {kind: impulse for kind, (impulse, _) in impulses_and_slips.items()}
 
 
@@ -294,31 +300,24 @@ def _sweep(
     stage: Callable,
     contacts: dict[str, Contact],
     hold: Callable[[Motion], Motion],
-    is_behind: Float[Array, "*envs"],
+    relaxation: Float[Array, "*envs"],
     motions: Motions,
-    impulses: dict[str, tuple],
+    before: dict[str, tuple],
 ) -> tuple[Motions, dict[str, tuple]]:
-    """Sweep over all kinds of contact, from the stiffest to the softest, where `is_behind` is 1; elsewhere it is 0.
+    """Solve all kinds of contact, from the stiffest to the softest; a relaxation of 0 changes nothing.
 
-    Contacts between discs are solved twice per sweep, and walls stop discs after each time, because piles of discs
-    separate most slowly.
+    Contacts between discs are solved twice, and walls stop discs after each time, because piles of discs separate most
+    slowly.
     """
-
-    def sweep(index: Array | int, carry: tuple) -> tuple:
-        motions, before = carry
-        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0) * is_behind
-        after = dict(before)
-        for kind in (*contacts, "disc_disc"):
-            contact, last = contacts[kind], after[kind]
-            moved = {body: motions[body] for body in contact.bodies}
-            after[kind] = stage(partial(contact.answer, relaxation, is_behind), moved, *last)
-            motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
-            if kind == "disc_disc":
-                held = hold(motions["disc"])
-                motions = motions | {"disc": _where(is_behind > 0, held, motions["disc"])}
-        return motions, after
-
-    return jax.lax.fori_loop(0, solver.iterations, sweep, (motions, impulses))
+    after = dict(before)
+    for kind in (*contacts, "disc_disc"):
+        contact, last = contacts[kind], after[kind]
+        moved = {body: motions[body] for body in contact.bodies}
+        after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
+        motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
+        if kind == "disc_disc":
+            motions = motions | {"disc": _where(relaxation > 0, hold(motions["disc"]), motions["disc"])}
+    return motions, after
 
 
 def _correct(solver: Solver, contact: Contact, motions: Motions, after: tuple, before: tuple) -> Motions:
