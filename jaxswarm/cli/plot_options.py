@@ -1,8 +1,8 @@
 """Options of the program `jaxswarm-plot`."""
 
 import dataclasses
-import os
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
