@@ -96,7 +96,7 @@ def test_evaluations_without_checkpoints_are_not_trained_over(undisturbed, tmp_p
             3,
             r"learner.learning_rate is \S+ there, and 1.0 here",
         ),
-        ({}, 4, r"seeds is \[3\] there, and \[4\] here"),
+        ({}, 4, "seed is 3 there, and 4 here"),
     ],
 )
 def test_another_run_is_not_resumed(undisturbed, tmp_path, changes, seed, message):

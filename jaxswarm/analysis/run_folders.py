@@ -72,8 +72,8 @@ def fields(config: configs.Config) -> Fields:
 def group(folders: Sequence[RunFolder], keys: Sequence[str] = ()) -> dict[str, list[RunFolder]]:
     """Group folders whose compared settings are equal.
 
-    The keys of the result are labels: the settings that differ between groups, or those of the full
-    keys in `keys`. Raises a `ConfigError` if `keys` give two groups the same label.
+    The keys of the result are labels: the settings that differ between groups, or those in `keys`
+    (full keys). Raises a `ConfigError` if `keys` give two groups the same label.
     """
     by_settings = defaultdict(list)
     for folder in folders:

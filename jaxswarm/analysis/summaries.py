@@ -134,17 +134,14 @@ def _cells(lines: Sequence[Line]) -> list[list[str]]:
     counts = [name for name in others if name in ("seeds", "diverged")]
     rows = [[label, *HEADS, *counts]]
     for line in lines:
-        of_heads = ([line[name] for name in names] for names in HEADS.values())
-        cells = [
-            _interval(value, low, high, "p_" in names[0])
-            for (value, low, high), names in zip(of_heads, HEADS.values(), strict=True)
-        ]
+        cells = [_interval([line[name] for name in names], "p_" in names[0]) for names in HEADS.values()]
         rows.append([str(line[label]), *cells, *[str(line[name]) for name in counts]])
     return rows
 
 
-def _interval(value: float, low: float, high: float, is_probability: bool) -> str:
+def _interval(numbers: Sequence[float], is_probability: bool) -> str:
     """Format a value with its interval: a probability with two decimals, other values with at least three digits."""
+    value, low, high = numbers
     if math.isnan(value):
         return "-"
     decimals = 2 if is_probability else _decimals(value)
