@@ -291,23 +291,15 @@ class Contact:
         return dataclasses.replace(self, normal=dataclasses.replace(self.normal, mass=mass), tangent=tangent)
 
     def answer(
-        self,
-        relaxation: Float[Array, "*envs"],
-        motions: Motions,
-        impulse: Array,
-        slip: Array | None,
+        self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
     ) -> tuple[Array, Array | None]:
-        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`.
-
-        With a relaxation of 0 they stay the previous ones.
-        """
+        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`."""
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
-        impulse = jnp.maximum(impulse - relaxation[None, None, None] * error, 0)
+        impulse = jnp.maximum(impulse - relaxation * error, 0)
         if self.tangent is None or slip is None:
             return impulse, None
         limit = self.friction * total(impulse, 0)[None]
-        error = self.tangent.mass * self.tangent.velocity(motions)
-        return impulse, jnp.clip(slip - jnp.sign(relaxation)[None, None, None] * error, -limit, limit)
+        return impulse, jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
 
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
         """Return the motions after these impulses."""
