@@ -308,6 +308,10 @@ class Contact:
             force = Force(*jax.tree.map(operator.add, force, self.tangent.force(slip)))
         return self.normal.push(solver, motions, force)
 
+    def displaced(self, shift: Motions) -> "Contact":
+        """Return the contacts with the gaps after these displacements, to first order."""
+        return dataclasses.replace(self, gap=self.gap + self.normal.velocity(shift))
+
     def depth(self) -> Float[Array, "*envs"]:
         """Return the deepest overlap in meters, at least 0."""
         return greatest(-self.gap * self.normal.near)

@@ -24,6 +24,7 @@ The moved states have these fields, in meters, radians and seconds, in a square 
 import dataclasses
 import functools
 import math
+import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ from jaxswarm.types import pytree
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5, max_overlap=5e-4)}
 
 GROWTH = 0.05  # share of `Solver.max_overlap` by which overlaps may grow per substep
+PARTING_SWEEPS = 8  # further displacements per substep of boxes with deep overlaps
 CROWDED = 0.06  # share of the floor that bodies cover, above which `settle` takes further rounds
 SETTLING_ROUNDS = 100  # most rounds of substeps of `settle`
 
@@ -231,6 +233,8 @@ def _substep(
     hold = partial(hold_discs, solver, side, bodies.disc)
     motions, impulses = _solve(solver, stage, contacts, hold, depth, motions, impulses)
     shift = stage(partial(_part_boxes, solver), contacts, bodies.box)
+    further = partial(_part_further, solver, contacts, depth > solver.max_overlap)
+    shift = jax.lax.cond(_any_env(depth > solver.max_overlap), further, lambda shift: shift, shift)
 
     def advance(place: Array, velocity: Array) -> Array:
         return place + solver.duration * velocity
@@ -345,6 +349,16 @@ def _any_env(is_chosen: Bool[Array, "*envs"]) -> Bool[Array, ""]:
 @_any_env.def_vmap
 def _any_env_of_all(_: int, is_batched: list, is_chosen: Array) -> tuple[Array, bool]:
     return jnp.any(is_chosen), False
+
+
+def _part_further(solver: Solver, contacts: dict[str, Contact], is_deep: Bool[Array, "*envs"], shift: Motion) -> Motion:
+    """Add displacements that remove most of what these leave of the overlaps, in environments with deep ones."""
+
+    def part(_: Array | int, more: Motion) -> Motion:
+        left = {kind: contacts[kind].displaced({"box": more}) for kind in ("box_box", "box_wall")}
+        return jax.tree.map(operator.add, more, _part_boxes(solver, left, more))
+
+    return _where(is_deep, jax.lax.fori_loop(0, PARTING_SWEEPS, part, shift), shift)
 
 
 def _together(_: Array | int, function: Callable, *args: Any) -> Any:

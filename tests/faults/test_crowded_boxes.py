@@ -55,14 +55,7 @@ def play(task, policy):
 @pytest.mark.slow
 @pytest.mark.parametrize("physics", rigid2d.PRESETS)
 @pytest.mark.parametrize("policy", LIMITS)
-@pytest.mark.parametrize(
-    "crowd",
-    [
-        "corner",
-        "swarm",
-        pytest.param("dense", marks=pytest.mark.xfail(reason="boxes still overlap by up to 5 mm", strict=False)),
-    ],
-)
+@pytest.mark.parametrize("crowd", CROWDS)
 def test_crowds_neither_overlap_nor_throw_boxes(crowd, policy, physics):
     num_agents, num_boxes, side = CROWDS[crowd]
     states = play(Assembly(num_agents=num_agents, num_boxes=num_boxes, side=side, physics=physics), policy)
