@@ -19,6 +19,7 @@ OVERRIDES = {
     "aggregation": ["aggregators=mean,max", "rows=8", "slots=3", "features=4", "repeats=1"],
     "box_physics": ["num_envs=1", "seconds=0.01"],
     "environment_throughput": ["num_envs=1", "num_agents=3", "repeats=1"],
+    "memory_growth": ["evaluations=3", "measurements=2"],
     "projections": ["rows=8", "repeats=1"],
     "seeds": ["seeds=1,2", "updates=1", *TINY],
     "training_throughput": ["repeats=1", "threshold=-9999", "seeds=2", "num_updates=2", *TINY],

@@ -76,7 +76,8 @@ def test_a_finished_run_can_be_made_longer(finished, capsys):
     ("overrides", "parts"),
     [
         (["num_updates=2"], ["2 updates", "at least 4 updates"]),
-        (["learner.learning_rate=1"], ["learner.learning_rate cannot be changed here", "num_updates=N"]),
+        (["learner.learning_rate=1"], ["learner.learning_rate=1: a resumed run keeps its settings", "init_from="]),
+        (["learner.rate=1"], ["learner.rate cannot be changed here", "num_updates=N"]),
         (["run_dir=x"], ["one of run_dir and resume"]),
     ],
 )
@@ -264,7 +265,7 @@ def test_a_policy_is_loaded(finished, tmp_path):
     assert experiment.network.apply(params, obs, method="policy").mean().shape == (3, 2)
     with pytest.raises(configs.ConfigError, match="seed: must be one of the trained seeds 5 to 5, got 7"):
         jaxswarm.load(finished, seed=7)
-    with pytest.raises(configs.ConfigError, match="cannot read"):
+    with pytest.raises(configs.ConfigError, match="is not a run folder"):
         jaxswarm.load(tmp_path)
 
 

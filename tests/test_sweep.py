@@ -192,7 +192,7 @@ def test_folders_that_cannot_be_written_are_named(where, tmp_path, monkeypatch, 
     assert program.main(["learner.discount=0.9,0.8", f"sweep_dir={where}"]) == 2
     assert where in capsys.readouterr().err
     assert program.main(["num_updates=1,2", "sweep_dir=new"]) == 2
-    assert "differ only in" in capsys.readouterr().err
+    assert "num_updates: must have one value in a sweep, got 1,2" in capsys.readouterr().err
 
 
 SPACE = """

@@ -9,6 +9,7 @@ import contextlib
 import errno
 import hashlib
 import json
+import logging
 import math
 import os
 import re
@@ -92,7 +93,7 @@ class Checkpoints:
         self._pending.result()
 
     def _write(self, update: int, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
-        def write(attempts: int = 3) -> None:
+        def write(attempts: int = 10) -> None:
             self._directory.mkdir(exist_ok=True)
             try:
                 _write(self._directory, update, arrays, record)
@@ -247,7 +248,14 @@ def _as_os_error(error: Exception, directory: Path) -> OSError:
 
 
 def _warm_up() -> None:
+    """Import Orbax, and silence its log of errors that it raises as well."""
     import orbax.checkpoint  # noqa: F401, PLC0415
+
+    logging.getLogger("absl").addFilter(_is_no_background_error)
+
+
+def _is_no_background_error(record: logging.LogRecord) -> bool:
+    return "raised an exception" not in str(record.msg)
 
 
 def _orbax() -> Any:

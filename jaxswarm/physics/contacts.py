@@ -291,23 +291,15 @@ class Contact:
         return dataclasses.replace(self, normal=dataclasses.replace(self.normal, mass=mass), tangent=tangent)
 
     def answer(
-        self,
-        relaxation: Float[Array, "*envs"],
-        motions: Motions,
-        impulse: Array,
-        slip: Array | None,
+        self, relaxation: Array, motions: Motions, impulse: Array, slip: Array | None
     ) -> tuple[Array, Array | None]:
-        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`.
-
-        With a relaxation of 0 they stay the previous ones.
-        """
+        """Return the impulses and friction impulses that answer these motions, from the previous `impulse, slip`."""
         error = self.normal.mass * (self.normal.velocity(motions) + self.bias)
-        impulse = jnp.maximum(impulse - relaxation[None, None, None] * error, 0)
+        impulse = jnp.maximum(impulse - relaxation * error, 0)
         if self.tangent is None or slip is None:
             return impulse, None
         limit = self.friction * total(impulse, 0)[None]
-        error = self.tangent.mass * self.tangent.velocity(motions)
-        return impulse, jnp.clip(slip - jnp.sign(relaxation)[None, None, None] * error, -limit, limit)
+        return impulse, jnp.clip(slip - self.tangent.mass * self.tangent.velocity(motions), -limit, limit)
 
     def push(self, solver: Solver, motions: Motions, impulse: Array, slip: Array | None = None) -> Motions:
         """Return the motions after these impulses."""
@@ -315,6 +307,10 @@ class Contact:
         if self.tangent is not None and slip is not None:
             force = Force(*jax.tree.map(operator.add, force, self.tangent.force(slip)))
         return self.normal.push(solver, motions, force)
+
+    def displaced(self, shift: Motions) -> "Contact":
+        """Return the contacts with the gaps after these displacements, to first order."""
+        return dataclasses.replace(self, gap=self.gap + self.normal.velocity(shift))
 
     def depth(self) -> Float[Array, "*envs"]:
         """Return the deepest overlap in meters, at least 0."""

@@ -24,6 +24,7 @@ The moved states have these fields, in meters, radians and seconds, in a square 
 import dataclasses
 import functools
 import math
+import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ from jaxswarm.types import pytree
 PRESETS = {"faithful": Solver(), "fast": Solver(substeps=5, max_overlap=5e-4)}
 
 GROWTH = 0.05  # share of `Solver.max_overlap` by which overlaps may grow per substep
+PARTING_SWEEPS = 8  # further displacements per substep of boxes with deep overlaps
 CROWDED = 0.06  # share of the floor that bodies cover, above which `settle` takes further rounds
 SETTLING_ROUNDS = 100  # most rounds of substeps of `settle`
 
@@ -231,6 +233,8 @@ def _substep(
     hold = partial(hold_discs, solver, side, bodies.disc)
     motions, impulses = _solve(solver, stage, contacts, hold, depth, motions, impulses)
     shift = stage(partial(_part_boxes, solver), contacts, bodies.box)
+    further = partial(_part_further, solver, contacts, depth > solver.max_overlap)
+    shift = jax.lax.cond(_any_env(depth > solver.max_overlap), further, lambda shift: shift, shift)
 
     def advance(place: Array, velocity: Array) -> Array:
         return place + solver.duration * velocity
@@ -259,65 +263,57 @@ def _solve(
     motions: Motions,
     impulses: dict[str, Array],
 ) -> tuple[Motions, dict[str, Array]]:
-    """Take one round of sweeps, and further rounds in environments where a deep overlap would still grow.
+    """Take one round of sweeps, and further rounds in environments where a deep overlap would still grow."""
+    one_round = partial(_round, solver, stage, contacts, hold)
 
-    `is_behind` is 1 in environments that take the round, and 0 elsewhere.
-    """
-
-    def growing(motions: Motions) -> Float[Array, "*envs"]:
+    def is_growing(motions: Motions) -> Bool[Array, "*envs"]:
         growth = [contact.growth(solver, motions) for contact in contacts.values()]
-        return 1.0 * (_deepest(growth) > GROWTH * solver.max_overlap)
+        return _deepest(growth) > GROWTH * solver.max_overlap
 
-    def advance(carry: tuple) -> tuple:
-        index, is_behind, motions, impulses = carry
-        is_last = (index + 1) % solver.iterations == 0
-        relaxation = jnp.where(is_last, 1.0, solver.relaxation) * is_behind
-        motions, impulses = _sweep(solver, stage, contacts, hold, relaxation, motions, impulses)
-        behind = jnp.where(is_last, 0, is_behind)
-        is_behind = jax.lax.cond(is_last & is_any_deep, growing, lambda _: behind, motions)
-        return index + 1, is_behind, motions, impulses
+    def again(_: Array | int, carry: tuple) -> tuple:
+        def advance(carry: tuple) -> tuple:
+            return _where(is_growing(carry[0]), one_round(*carry), carry)
 
-    def is_unfinished(carry: tuple) -> Bool[Array, ""]:
-        return (carry[0] < most) & _any_env(carry[1] > 0)
+        return jax.lax.cond(_any_env(is_growing(carry[0])), advance, lambda carry: carry, carry)
 
-    most, is_any_deep = solver.rounds * solver.iterations, _any_env(depth > solver.max_overlap)
+    def refine(carry: tuple) -> tuple:
+        return jax.lax.fori_loop(1, solver.rounds, again, carry)
+
     slips = {kind: contact.tangent and 0 * contact.tangent.near for kind, contact in contacts.items()}
-    start = {kind: (impulses[kind], slips[kind]) for kind in contacts}
-    carry = (jnp.array(0), 1 + 0 * depth, motions, start)
-    if stage.func is _apart:
-        *_, motions, impulses_and_slips = jax.lax.while_loop(is_unfinished, advance, carry)
-    else:  # derivatives need a fixed number of sweeps
-
-        def attempt(_: Array | int, carry: tuple) -> tuple:
-            return jax.lax.cond(is_unfinished(carry), advance, lambda carry: carry, carry)
-
-        *_, motions, impulses_and_slips = jax.lax.fori_loop(0, most, attempt, carry)
+    carry = one_round(motions, {kind: (impulses[kind], slips[kind]) for kind in contacts})
+    is_any_deep = _any_env(depth > solver.max_overlap)
+    motions, impulses_and_slips = jax.lax.cond(is_any_deep, refine, lambda carry: carry, carry)
     return motions, {kind: impulse for kind, (impulse, _) in impulses_and_slips.items()}
 
 
-def _sweep(
+def _round(
     solver: Solver,
     stage: Callable,
     contacts: dict[str, Contact],
     hold: Callable[[Motion], Motion],
-    relaxation: Float[Array, "*envs"],
     motions: Motions,
-    before: dict[str, tuple],
+    impulses: dict[str, tuple],
 ) -> tuple[Motions, dict[str, tuple]]:
-    """Solve all kinds of contact, from the stiffest to the softest; a relaxation of 0 changes nothing.
+    """Sweep over all kinds of contact, from the stiffest to the softest.
 
-    Contacts between discs are solved twice, and walls stop discs after each time, because piles of discs separate most
-    slowly.
+    Contacts between discs are solved twice per sweep, and walls stop discs after each time, because piles of discs
+    separate most slowly.
     """
-    after = dict(before)
-    for kind in (*contacts, "disc_disc"):
-        contact, last = contacts[kind], after[kind]
-        moved = {body: motions[body] for body in contact.bodies}
-        after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
-        motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
-        if kind == "disc_disc":
-            motions = motions | {"disc": _where(relaxation > 0, hold(motions["disc"]), motions["disc"])}
-    return motions, after
+
+    def sweep(index: Array | int, carry: tuple) -> tuple:
+        motions, before = carry
+        relaxation = jnp.where(index < solver.iterations - 1, solver.relaxation, 1.0)
+        after = dict(before)
+        for kind in (*contacts, "disc_disc"):
+            contact, last = contacts[kind], after[kind]
+            moved = {body: motions[body] for body in contact.bodies}
+            after[kind] = stage(partial(contact.answer, relaxation), moved, *last)
+            motions = motions | stage(partial(_correct, solver, contact), moved, after[kind], last)
+            if kind == "disc_disc":
+                motions = motions | {"disc": hold(motions["disc"])}
+        return motions, after
+
+    return jax.lax.fori_loop(0, solver.iterations, sweep, (motions, impulses))
 
 
 def _correct(solver: Solver, contact: Contact, motions: Motions, after: tuple, before: tuple) -> Motions:
@@ -353,6 +349,16 @@ def _any_env(is_chosen: Bool[Array, "*envs"]) -> Bool[Array, ""]:
 @_any_env.def_vmap
 def _any_env_of_all(_: int, is_batched: list, is_chosen: Array) -> tuple[Array, bool]:
     return jnp.any(is_chosen), False
+
+
+def _part_further(solver: Solver, contacts: dict[str, Contact], is_deep: Bool[Array, "*envs"], shift: Motion) -> Motion:
+    """Add displacements that remove most of what these leave of the overlaps, in environments with deep ones."""
+
+    def part(_: Array | int, more: Motion) -> Motion:
+        left = {kind: contacts[kind].displaced({"box": more}) for kind in ("box_box", "box_wall")}
+        return jax.tree.map(operator.add, more, _part_boxes(solver, left, more))
+
+    return _where(is_deep, jax.lax.fori_loop(0, PARTING_SWEEPS, part, shift), shift)
 
 
 def _together(_: Array | int, function: Callable, *args: Any) -> Any:

@@ -113,6 +113,8 @@ def remove(folder):
         shutil.rmtree(folder, ignore_errors=True)
 
 
+# Orbax leaves futures of a checkpoint behind whose folder is deleted while it is written.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", ["metrics.csv", "config.yaml", "checkpoints/metrics.csv", "checkpoints"])
 def test_deleted_files_are_restored(name, undisturbed, tmp_path, capsys):
     run_dir = tmp_path / "run"
@@ -128,6 +130,7 @@ def test_deleted_files_are_restored(name, undisturbed, tmp_path, capsys):
     assert "deleted during training" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_deleted_run_folder_ends_training(tmp_path):
     run_dir = tmp_path / "run"
     with pytest.raises(OSError, match="was deleted or moved during training"):
