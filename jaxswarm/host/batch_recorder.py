@@ -89,11 +89,12 @@ class BatchRecorder:
         folder, num_saved = self.recorders[0].run.run_dir, min(recorder.last_saved for recorder in self.recorders)
         if folder is None:
             return error
-        if error.errno == errno.ENOENT and not (folder / "config.yaml").exists():
+        is_described = (folder / "config.yaml").exists()
+        if self.recorders[0].was_described and not is_described:
             return OSError(f"{folder} was deleted or moved during training, so training stopped")
         text = f"{folder}: {(error.strerror or str(error)).lower()}; "
         text += f"the last {self._num_done - num_saved} updates were not saved. "
-        if not (folder / "config.yaml").exists():
+        if not is_described:
             return OSError(text + "Nothing was written")
         remedy = _REMEDIES.get(error.errno or 0, "Mend this")
         return OSError(f"{text}{remedy}, then run: {resume_command(folder)}")

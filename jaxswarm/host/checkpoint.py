@@ -93,12 +93,12 @@ class Checkpoints:
         self._pending.result()
 
     def _write(self, update: int, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
-        def write(attempts: int = 10) -> None:
+        def write(attempts: int = 5) -> None:
             self._directory.mkdir(exist_ok=True)
             try:
                 _write(self._directory, update, arrays, record)
-            except FileNotFoundError:  # somebody is deleting the directory
-                if attempts == 1:
+            except OSError as error:  # somebody may be deleting the directory
+                if error.errno not in (errno.ENOENT, errno.EIO) or attempts == 1:
                     raise
                 threading.Event().wait(0.2)
                 write(attempts - 1)

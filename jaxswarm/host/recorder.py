@@ -56,6 +56,7 @@ class Recorder:
         self._last: _Candidate | None = None
         self._best: _Candidate | None = None  # better than every checkpoint on disk, and not saved yet
         self._last_plotted = time.monotonic()
+        self.was_described = False  # config.yaml was written
         self.last_saved = restored.update if restored else 0  # update of the latest checkpoint, once this is closed
 
     def open(self) -> None:
@@ -82,6 +83,7 @@ class Recorder:
         content = manifest.describe(run.experiment, run.num_updates, run.seeds)
         content |= {"run_id": self._identity["run_id"], "imports": imports}
         content |= {"changes_since_checkpoint": self._point.changes if self._point else []}
+        self.was_described = run.config is not None
         manifest.write_manifest(run.folder / "manifest.json", content)
 
     def close(self) -> None:

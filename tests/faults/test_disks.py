@@ -16,6 +16,8 @@ from jaxswarm.host import checkpoint
 from jaxswarm.host.fit import fit_runs
 from jaxswarm.host.run import Run
 
+# Orbax leaves futures of a checkpoint behind that cannot be written to its end.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 OVERRIDES = (
     "task.num_agents=3 task.episode_length=5 num_envs=2 num_steps=4 learner.batch_size=12 num_eval_envs=2 eval_every=2 "
     "network.encoder=[4] network.decoder=[4] num_updates=8 checkpoint_seconds=0"
@@ -113,8 +115,7 @@ def remove(folder):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-# Orbax leaves futures of a checkpoint behind whose folder is deleted while it is written.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["metrics.csv", "config.yaml", "checkpoints/metrics.csv", "checkpoints"])
 def test_deleted_files_are_restored(name, undisturbed, tmp_path, capsys):
     run_dir = tmp_path / "run"
@@ -130,7 +131,7 @@ def test_deleted_files_are_restored(name, undisturbed, tmp_path, capsys):
     assert "deleted during training" in capsys.readouterr().err
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.slow
 def test_a_deleted_run_folder_ends_training(tmp_path):
     run_dir = tmp_path / "run"
     with pytest.raises(OSError, match="was deleted or moved during training"):
@@ -154,6 +155,7 @@ def mounted(tmp_path):
     subprocess.run(["umount", str(folder)], capture_output=True, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", ["size=4k", "size=40k", "size=300k", "size=450k", "nr_inodes=5", "nr_inodes=90"])
 def test_small_disks(options, undisturbed, mounted):
     folder = mounted(options)
@@ -163,6 +165,7 @@ def test_small_disks(options, undisturbed, mounted):
     assert_recovers(folder / "run", undisturbed)
 
 
+@pytest.mark.slow
 def test_a_disk_that_becomes_read_only(undisturbed, mounted):
     folder = mounted("size=50m")
     with pytest.raises(OSError, match="read-only file system"):
