@@ -39,29 +39,36 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
                 code = _print_version() if arguments == ["--version"] else main(arguments)
             sys.stdout.flush()
             return code
-        except ConfigError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2
         except KeyboardInterrupt:
             print("aborted", file=sys.stderr)
             return 130
         except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the final flush of Python
             return 141
-        except OSError as error:
-            path = schema.shown(str(error.filename)).strip("'")
-            reason = f"{path}: {error.strerror}" if error.filename and error.strerror else error
+        except (ConfigError, OSError, RuntimeError) as error:
+            code, reason = _explain(error)
             print(f"error: {reason}", file=sys.stderr)
-            return 2 if error.errno in UNUSABLE_PATH else 1
-        except RuntimeError as error:
-            if "RESOURCE_EXHAUSTED" not in str(error):
-                raise
-            from jaxswarm.host.ensemble import LESS_MEMORY  # noqa: PLC0415
-
-            print(f"error: out of memory; {LESS_MEMORY} ({str(error).splitlines()[0]})", file=sys.stderr)
-            return 1
+            return code
 
     return program
+
+
+def _explain(error: Exception) -> tuple[int, str]:
+    """Return the exit code and the line for an error of the user or of the machine; raise any other error."""
+    first_line = next(iter(str(error).splitlines()), "")
+    if isinstance(error, ConfigError):
+        return 2, str(error)
+    if isinstance(error, OSError):
+        path = schema.shown(str(error.filename)).strip("'")
+        reason = f"{path}: {error.strerror}" if error.filename and error.strerror else str(error)
+        return 2 if error.errno in UNUSABLE_PATH else 1, reason
+    if "Unable to initialize backend" in first_line:
+        return 1, f"JAX_PLATFORMS: {first_line}"
+    if "RESOURCE_EXHAUSTED" not in str(error):
+        raise error
+    from jaxswarm.host.ensemble import LESS_MEMORY  # noqa: PLC0415
+
+    return 1, f"out of memory; {LESS_MEMORY} ({first_line})"
 
 
 @contextlib.contextmanager
@@ -178,11 +185,17 @@ def load_config(run_dir: Path) -> Config:
 
 
 def use_compile_cache() -> None:
-    """Cache compiled programs on disk for later starts; must be called before anything is compiled."""
+    """Cache compiled programs on disk for later starts; must be called before anything is compiled.
+
+    A user without a home directory, as in a container with a foreign user id, gets no cache.
+    """
     import jax  # noqa: PLC0415
 
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        try:
+            home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        except RuntimeError:
+            return
         jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxswarm" / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

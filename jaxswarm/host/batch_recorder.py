@@ -161,7 +161,8 @@ class BatchRecorder:
     def report_diverged(self, states: TrainState) -> None:
         """Save the frozen states of seeds that have diverged since the last call, and warn about them.
 
-        `states` are those after the recorded chunk, or after a later one. Raises a `DivergedError` if no seed is left.
+        `states` are those after the recorded chunk, or after a later one. Raises a `DivergedError` if no seed is left;
+        with JAX_DEBUG_NANS, for the first seed.
         """
         diverged = [(recorder, seed) for recorder in self.recorders for seed in recorder.diverged]
         new, self._num_reported = diverged[self._num_reported :], len(diverged)
@@ -172,7 +173,7 @@ class BatchRecorder:
             for seed in [seed for owner, seed in new if owner is recorder]:
                 start = part.start + recorder.run.seeds.index(seed)
                 self.progress.warn(_describe_divergence(recorder, seed, _slice(states, slice(start, start + 1))))
-        if len(diverged) == self.batch.num_runs:
+        if len(diverged) == self.batch.num_runs or jax.config.read("jax_debug_nans"):
             reason = diverged[-1][0].reason[diverged[-1][1]]
             raise DivergedError(f"{reason}; training stopped", [recorder.rows for recorder in self.recorders])
 

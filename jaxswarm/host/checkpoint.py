@@ -349,6 +349,7 @@ def _from_arrays(arrays: dict[str, np.ndarray], key_impls: dict[str, str], templ
         leaf = jax.random.wrap_key_data(jnp.asarray(array), impl=key_impls[name]) if name in key_impls else array
         if (leaf.shape, leaf.dtype) != (expected.shape, expected.dtype):
             found, wanted = (f"{x.dtype}{list(x.shape)}" for x in (leaf, expected))
-            raise _MismatchError(f"checkpoint {path}: {name} is {found}, but these settings need {wanted}")
+            hint = f"; set JAX_DEFAULT_PRNG_IMPL={key_impls[name]}" if name in key_impls else ""
+            raise _MismatchError(f"checkpoint {path}: {name} is {found}, but these settings need {wanted}{hint}")
         leaves.append(jnp.asarray(leaf))
     return jax.tree.unflatten(jax.tree.structure(template), leaves)

@@ -190,7 +190,11 @@ def compile_batch(batch: RunBatch, states: TrainState, size: int, warn: Callable
         width = max(n for n in smaller if n == 1 or n <= width * free / needed)
         warn(f"{num_local} vectorized runs need {sizes}; training {width} at a time")
 
-    return lambda experiments, states, num_updates: program(experiments, states, np.int32(num_updates))
+    def run(experiments: Experiment, states: TrainState, num_updates: Any) -> tuple[TrainState, Metrics]:
+        with jax.debug_nans(False):  # metrics that are not computed are NaN; training detects all others itself
+            return program(experiments, states, np.int32(num_updates))
+
+    return run
 
 
 def compiler_options() -> dict[str, Any] | None:
@@ -207,7 +211,7 @@ def _advance(
 
 def evaluate_batch(batch: RunBatch, states: TrainState) -> Metrics:
     """Evaluate the deterministic policy of every run; metrics [runs]."""
-    with _on(batch):
+    with _on(batch), jax.debug_nans(False):
         return _evaluate(batch.experiments, states, batch.mesh)
 
 

@@ -139,7 +139,7 @@ class _Bodies:
     """State of all bodies that a substep changes."""
 
     disc: Pose
-    box: Motion  # places and headings
+    box: Motion  # positions and headings
     velocity: Motion  # of the boxes
     impulses: dict[str, Array]  # of each kind of contact
     depth: Float[Array, "*envs"]  # m, deepest overlap at the start of the last substep
@@ -212,7 +212,7 @@ def _settle(
 
 
 def _wrap(angle: Array) -> Array:
-    """The angle in [-pi, pi]; a full turn is taken off in two parts, so that nothing is rounded."""
+    """Return the angle in [-pi, pi]; a full turn is subtracted in two parts, so that nothing is rounded."""
     num_turns = jnp.round(angle / (2 * math.pi))
     return (angle - 6.28125 * num_turns) - (2 * math.pi - 6.28125) * num_turns
 
@@ -247,7 +247,7 @@ def _substep(
 def _warm_start(
     solver: Solver, contacts: dict[str, Contact], motions: Motions, impulses: dict[str, Array]
 ) -> tuple[Motions, dict[str, Array]]:
-    """Begins with the impulses of the substep before, where there still is contact."""
+    """Apply the impulses of the substep before to pairs that are still in contact."""
     impulses = {kind: impulses[kind] * contact.normal.near for kind, contact in contacts.items()}
     for kind, contact in contacts.items():
         motions = contact.push(solver, motions, impulses[kind])

@@ -1,4 +1,4 @@
-"""A run that is killed at random moments resumes to the same numbers, and readers beside it see complete states only."""
+"""A run that is killed at any moment resumes to the same numbers, and readers beside it see complete states only."""
 
 import os
 import signal
