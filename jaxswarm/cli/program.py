@@ -64,6 +64,8 @@ def _explain(error: Exception) -> tuple[int, str]:
         return 2 if error.errno in UNUSABLE_PATH else 1, reason
     if "Unable to initialize backend" in first_line:
         return 1, f"JAX_PLATFORMS: {first_line}"
+    if type(error).__module__.startswith("jaxswarm."):  # no seed or no checkpoint is left
+        return 1, first_line
     if "RESOURCE_EXHAUSTED" not in str(error):
         raise error
     from jaxswarm.host.ensemble import LESS_MEMORY  # noqa: PLC0415
