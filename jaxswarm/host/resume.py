@@ -66,7 +66,7 @@ def final_lines(run: Run, restored: Restored) -> list[str]:
     return files.format_rows(_readable_rows(run.folder)) if lines is None else lines
 
 
-def _restore(run: Run, run_id: str | None, up_to: float) -> Restored | None:
+def _restore(run: Run, run_id: str | None, up_to: int | float) -> Restored | None:
     template = abstract_state(run.experiment, len(run.seeds))
     return restore(run.folder / "checkpoints", template, on_damage=_warn, up_to=up_to, run_id=run_id)
 
