@@ -173,7 +173,8 @@ class BatchRecorder:
             for seed in [seed for owner, seed in new if owner is recorder]:
                 start = part.start + recorder.run.seeds.index(seed)
                 self.progress.warn(_describe_divergence(recorder, seed, _slice(states, slice(start, start + 1))))
-        if len(diverged) == self.batch.num_runs or jax.config.read("jax_debug_nans"):
+        is_debugging = jax.config.jax_debug_nans  # pyright: ignore[reportAttributeAccessIssue]
+        if len(diverged) == self.batch.num_runs or is_debugging:
             reason = diverged[-1][0].reason[diverged[-1][1]]
             raise DivergedError(f"{reason}; training stopped", [recorder.rows for recorder in self.recorders])
 
