@@ -9,6 +9,7 @@ import os
 import shlex
 import shutil
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ def program(main: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str] | N
         except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the final flush of Python
             return 141
-        except (ConfigError, OSError, RuntimeError) as error:
+        except (ConfigError, OSError, RuntimeError, AssertionError) as error:
             code, reason = _explain(error)
             print(f"error: {reason}", file=sys.stderr)
             return code
@@ -62,8 +63,8 @@ def _explain(error: Exception) -> tuple[int, str]:
         path = schema.shown(str(error.filename)).strip("'")
         reason = f"{path}: {error.strerror}" if error.filename and error.strerror else str(error)
         return 2 if error.errno in UNUSABLE_PATH else 1, reason
-    if "Unable to initialize backend" in first_line:
-        return 1, f"JAX_PLATFORMS: {first_line}"
+    if "JAX_PLATFORMS" in os.environ and _is_of_backend(error):
+        return 1, f"JAX_PLATFORMS: must name devices that can be used here, got {os.environ['JAX_PLATFORMS']!r}"
     if type(error).__module__.startswith("jaxswarm."):  # no seed or no checkpoint is left
         return 1, first_line
     if "RESOURCE_EXHAUSTED" not in str(error):
@@ -71,6 +72,12 @@ def _explain(error: Exception) -> tuple[int, str]:
     from jaxswarm.host.ensemble import LESS_MEMORY  # noqa: PLC0415
 
     return 1, f"out of memory; {LESS_MEMORY} ({first_line})"
+
+
+def _is_of_backend(error: BaseException) -> bool:
+    """Return whether JAX raised the error when it initialized its devices."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and Path(frames[-1].filename).name == "xla_bridge.py"
 
 
 @contextlib.contextmanager

@@ -174,6 +174,8 @@ def compile_batch(batch: RunBatch, states: TrainState, size: int, warn: Callable
     Calls `warn` with one line if fewer runs fit than there are, or if not even one does.
     """
     num_local = batch.num_runs // (batch.mesh.shape[RUNS_AXIS] if batch.mesh else 1)
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        return lambda experiments, states, num_updates: _advance(experiments, states, num_updates, size, 1, batch.mesh)
     width = num_local if jax.default_backend() != "cpu" else math.gcd(num_local, CPU_WIDTH)
     while True:
         with _on(batch):
