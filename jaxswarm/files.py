@@ -130,8 +130,13 @@ def read_rows(path: Path) -> list[Row]:
 
     Raises a `ValueError` for a file that is damaged in another way.
     """
+    return parse_rows(read_lines(path))
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the complete lines of a text file, without a truncated last line; a missing file has none."""
     text = read_text(path)
-    return parse_rows(text[: text.rfind("\n") + 1].splitlines())
+    return text[: text.rfind("\n") + 1].splitlines()
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:

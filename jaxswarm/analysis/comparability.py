@@ -1,4 +1,4 @@
-"""Which metric compares runs of a task whose settings differ.
+"""Choice of the metric that compares runs of a task with different settings.
 
 The scale of a return depends on some settings of the task. A task declares them, with metrics that do not depend on
 them, in `comparable_metrics`.

@@ -16,7 +16,7 @@ import jax
 
 
 class Identity(TypedDict):
-    """What a checkpoint stores about its run."""
+    """Identity of a run, as its checkpoints store it."""
 
     run_id: str
     config: dict[str, Any] | None  # of config.yaml; None: no config describes the run

@@ -91,10 +91,9 @@ def _paths(run_dir: Path) -> tuple[Path, Path]:
 def _lines(path: Path) -> list[str]:
     """Return the complete lines of a file; a file that cannot be read has none."""
     try:
-        text = files.read_text(path)
+        return files.read_lines(path)
     except (OSError, ValueError):
         return []
-    return text[: text.rfind("\n") + 1].splitlines()
 
 
 def _text(lines: Iterable[str]) -> str:

@@ -19,7 +19,7 @@ from jaxswarm.host.checkpoint import Restored, read_records, restore, set_aside
 from jaxswarm.host.ensemble import abstract_state, broadcast_from_first
 from jaxswarm.host.manifest import read_manifest
 from jaxswarm.host.metrics_log import verified_lines
-from jaxswarm.host.run import Run, changed_settings
+from jaxswarm.host.run import Run, changed_settings, read_rows
 
 
 class ResumePoint(NamedTuple):
@@ -63,7 +63,7 @@ def final_lines(run: Run, restored: Restored) -> list[str]:
     """Return the lines of `metrics.csv` of a run that has reached its end, restored from its copy if necessary."""
     digest = restored.record.get("final_rows")
     lines = None if digest is None else verified_lines(run.folder, digest, _warn)
-    return files.format_rows(_readable_rows(run.folder)) if lines is None else lines
+    return files.format_rows(read_rows(run.folder)) if lines is None else lines
 
 
 def _restore(run: Run, run_id: str | None, up_to: int | float) -> Restored | None:
@@ -105,7 +105,7 @@ def _set_aside(run_dir: Path, update: int, restored: Restored | None) -> None:
 def _verified(run: Run, restored: Restored, force: bool) -> ResumePoint:
     stored = restored.identity
     if stored is None:
-        rows = [row for row in _readable_rows(run.folder) if row["update"] < restored.update]
+        rows = [row for row in read_rows(run.folder) if row["update"] < restored.update]
         return ResumePoint(restored, files.format_rows(rows), [])
     if stored["config"] is not None and run.config is not None:
         _check_settings(run, stored["config"], run.config, force)
@@ -113,7 +113,7 @@ def _verified(run: Run, restored: Restored, force: bool) -> ResumePoint:
     lines = verified_lines(run.folder, restored.record["rows"], _warn)
     if lines is None:
         _refuse(run, f"{run.folder / 'metrics.csv'} and its copy have been changed or damaged", "the rows left", force)
-        rows = [row for row in _readable_rows(run.folder) if row["update"] < restored.update]
+        rows = [row for row in read_rows(run.folder) if row["update"] < restored.update]
         lines = files.format_rows(rows)
     changes = identity.changes(stored["circumstances"], identity.circumstances(run.experiment))
     if changes:
@@ -146,13 +146,6 @@ def _refuse(run: Run, text: str, continuing: str, force: bool) -> None:
         command = resume_command(run.folder, "force=true")
         raise ConfigError(f"{text}; to continue with {continuing}: {command}")
     _warn(text)
-
-
-def _readable_rows(run_dir: Path) -> list[files.Row]:
-    try:
-        return files.read_rows(run_dir / "metrics.csv")
-    except (ValueError, KeyError) as error:
-        raise ConfigError(f"cannot read {run_dir / 'metrics.csv'}: {error}") from error
 
 
 def _warn(text: str) -> None:

@@ -183,10 +183,18 @@ def check_folder(run: Run, resume: bool, force: bool = False) -> None:
 
 def _rows(run_dir: Path) -> list[files.Row]:
     try:
-        return files.read_rows(run_dir / "metrics.csv")
-    except (ValueError, KeyError) as error:
+        return read_rows(run_dir)
+    except ConfigError:
         if has_checkpoint(run_dir):  # which may restore the rows
             return []
+        raise
+
+
+def read_rows(run_dir: Path) -> list[files.Row]:
+    """Return the rows of a run's `metrics.csv`; raises a `ConfigError` if the file is damaged."""
+    try:
+        return files.read_rows(run_dir / "metrics.csv")
+    except (ValueError, KeyError) as error:
         raise ConfigError(f"cannot read {run_dir / 'metrics.csv'}: {error}") from error
 
 
